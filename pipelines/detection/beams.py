@@ -60,8 +60,8 @@ class Beams(NamedTuple):
         How deep the beams end, in the mean, that pass the object by on the same side.
     merged : (n,)
         Probability that the echoes of the object and of what is there are one; zero at first.
-    blur, blur_up : float
-        Half the width of a beam across and up.
+    widths : (2, 2)
+        Half the width of a beam across and up, as ``Evidence.widths``.
     lost, faintest : float
         Share of the pulses on a surface that are not heard, and of a beam that must be on it.
     """
@@ -76,8 +76,7 @@ class Beams(NamedTuple):
     even: Array
     away: Array
     merged: Array
-    blur: float
-    blur_up: float
+    widths: Array
     lost: float
     faintest: float
 
@@ -127,8 +126,7 @@ def beams_about(
         even=even,
         away=away,
         merged=np.zeros(len(kept)),
-        blur=blurs[0],
-        blur_up=blurs[1],
+        widths=evidence.widths / radius,
         lost=hearing[0],
         faintest=hearing[1],
     )

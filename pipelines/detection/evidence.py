@@ -74,8 +74,9 @@ class Evidence(NamedTuple):
     silent : (3, k), optional
         Where pulses without a return pass it, across and up [m], and their face; None where times
         or rings do not show them.
-    blur : (2,)
-        Half the width of a beam across and up the line of sight [m].
+    widths : (2, 2)
+        Half the width of a beam across and up the line of sight: that by its width square to the
+        spin axis, and that by its width along it. Their squares add [m].
     height, sigma_height : float
         Height of the centre above the ground about it, and its standard deviation [m]; infinite
         where too little ground is seen.
@@ -91,9 +92,14 @@ class Evidence(NamedTuple):
     faces: Array
     strengths: Array
     silent: Array | None
-    blur: Array
+    widths: Array
     height: float = np.nan
     sigma_height: float = np.inf
+
+    @property
+    def blur(self) -> Array:
+        """Half the width of a beam across and up the line of sight, (2,) [m]."""
+        return np.asarray(np.hypot(*self.widths.T))
 
     @property
     def shows_below(self) -> bool:
@@ -193,7 +199,7 @@ def _evidence_at(
         faces=faces,
         strengths=cloud.intensities[rows] / np.sum(points.astype(np.float64) ** 2, axis=1),
         silent=silent,
-        blur=_half_widths(cloud.rig, angles, c, target),
+        widths=_half_widths(cloud.rig, angles, c, target),
     )
 
 
@@ -219,17 +225,16 @@ def _origins(rig: Rig, angles: Column) -> Array:
 
 
 def _half_widths(rig: Rig, angles: Column, c: Array, target: Target) -> Array:
-    """Return half the width of a beam at a place across and up the line of sight [m]."""
+    """Return ``Evidence.widths`` at a place."""
     if not len(angles):
-        return np.full(2, blur_at(c, target))
+        return np.full((2, 2), blur_at(c, target)) * (1.0, 0.0)
     angle = angles[len(angles) // 2]
     x, y, z = rig.T_head_lidar[:3, 2]
     axis = (np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y, z)
     view = view_of(c, target.up)
-    share = np.array([np.dot(axis, view.across), np.dot(axis, view.up)]) ** 2
-    sweep, along = rig.divergence**2
-    half: Array = 0.5 * np.linalg.norm(c) * np.sqrt(share * along + (1.0 - share) * sweep)
-    return half
+    along = np.minimum(np.abs([np.dot(axis, view.across), np.dot(axis, view.up)]), 1.0)
+    shares = np.column_stack([np.sqrt(1.0 - along * along), along])
+    return np.asarray(0.5 * np.linalg.norm(c) * shares * rig.divergence)
 
 
 @compiled

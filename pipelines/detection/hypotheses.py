@@ -14,8 +14,9 @@ import numpy as np
 from spheremark.pipelines.detection.beams import GATES, beams_about, merged_within
 from spheremark.pipelines.detection.evidence import Evidence
 from spheremark.pipelines.detection.faces import MOVED, TURNED
-from spheremark.pipelines.detection.search import compared, cov_shared
+from spheremark.pipelines.detection.search import compared, shared_by
 from spheremark.pipelines.detection.shapes import (
+    ALONG,
     BALL,
     BOULDER,
     CLUTTER,
@@ -101,11 +102,12 @@ class Physics(NamedTuple):
 
     Attributes
     ----------
-    shared, sigmas : (5,)
+    shared, sigmas : (6,)
         What its markers have in common, and how far that may be off: the logarithm of the noise of
         ranges [m]; half widths of a beam outside an outline where half the beams hit, before
         nothing that is heard, and, beyond where both are as strong, before something; and the
-        logarithms of how far depths are stretched and of how far the radius is another.
+        logarithms of how much wider beams are along the spin axis than their data sheet says, of
+        how far depths are stretched and of how far the radius is another.
     lost : float
         Share of the pulses on a surface without a return.
     weakest : float
@@ -121,12 +123,12 @@ class Physics(NamedTuple):
     gates: Array = np.eye(1, len(GATES))[0]
 
 
-USUAL = (1.0, -0.1, 0.0, 0.0)  # edges: measured on markers of random worlds
+USUAL = (1.0, -0.1, 0.0, 0.0, 0.0)  # edges: measured on markers of random worlds
 """What markers share in a scan that nothing is known of, as in ``Physics``, but for the noise."""
 
-SIGMAS = (0.35, 0.6, 0.1, 0.02)
-"""How far these may be off: what an echo is moves the limb, and the limb against the middle. Radii
-of markers are known to 2 % in common."""
+SIGMAS = (0.35, 0.6, 0.35, 0.1, 0.02)
+"""How far these may be off: what an echo is moves the limb, and the limb against the middle. A beam
+that is twice as wide one way by its data sheet may be round. Radii are known to 2 % in common."""
 
 
 def log_likelihoods(
@@ -156,7 +158,7 @@ def log_likelihoods(
 
     Returns
     -------
-    (k,), (5,), (5, 5), (k, p), (9,)
+    (k,), (6,), (6, 6), (k, p), (9,)
         Logarithms; what markers share, as in ``Physics``, and its covariance; the best shapes;
         the logarithms of the likelihoods of the best sphere by each of ``GATES``.
 
@@ -189,9 +191,8 @@ def log_likelihoods(
     found, shapes = compared(beams, priors, logs, begun)
     sphere = shapes[SPHERE]
     never = float(found.max()) - _NEVER
-    shared = sphere[NOISE : FORM + 1].copy()
+    shared, cov = shared_by(sphere, priors[SPHERE], physics.sigmas[ALONG - NOISE], beams)
     shared[0] += np.log(radius)
-    cov = cov_shared(sphere, priors[SPHERE], beams)
     by_gate, densities = np.empty(len(GATES)), np.empty(len(beams.x))
     for i, gate in enumerate(np.eye(len(GATES))):
         own = merged_within(beams, gate, radius)
@@ -204,10 +205,10 @@ def _priors(radius: float, physics: Physics) -> Array:
     priors = np.zeros((len(NAMES), 2, N_PARAMETERS))
     priors[:, 1, :3], priors[:, 0, Z] = _CENTRE, -MEAN
     noise = float(np.exp(physics.shared[0])) / radius
-    priors[:, 0, NOISE:STRETCH] = np.log(noise), *physics.shared[1:3]
-    priors[:, 1, NOISE:STRETCH] = physics.sigmas[:3]
-    priors[: BALL + 1, :, STRETCH] = physics.shared[3], physics.sigmas[3]
-    priors[SPHERE, :, FORM] = physics.shared[4], physics.sigmas[4]
+    priors[:, 0, NOISE:STRETCH] = np.log(noise), *physics.shared[1:4]
+    priors[:, 1, NOISE:ALONG] = physics.sigmas[:3]
+    priors[: BALL + 1, :, STRETCH] = physics.shared[4], physics.sigmas[4]
+    priors[SPHERE, :, FORM] = physics.shared[5], physics.sigmas[5]
     half, height, spread = _HEAD_SIZE
     head = ((np.log(half / radius), spread), (np.log(height), spread), (np.log(height), spread))
     for kind, form in {**_FORMS, HEAD: head}.items():

@@ -10,6 +10,7 @@ import numpy as np
 from spheremark.pipelines.detection.beams import Beams
 from spheremark.pipelines.detection.maxima import climbed, information, searched, walked
 from spheremark.pipelines.detection.shapes import (
+    ALONG,
     BALL,
     BOULDER,
     CLUTTER,
@@ -59,13 +60,21 @@ def _evidence_nearby(kind: int, shape: Array, prior: Array, beams: Beams) -> flo
     return float(found + log_volume(kind, shape, prior, beams))
 
 
-def cov_shared(shape: Array, prior: Array, beams: Beams) -> Array:
-    """Return the covariance of what the best sphere shares with other markers."""
+def shared_by(sphere: Array, prior: Array, sigma_along: float, beams: Beams) -> tuple[Array, Array]:
+    """Return what a sphere shares with other markers, from the best one, and its covariance.
+
+    How much wider beams are along the spin axis is known to a sigma; the comparison takes it as
+    given, as what all hypotheses have in common.
+    """
+    shape, prior = sphere.copy(), prior.copy()
+    prior[1, ALONG] = sigma_along
+    found = log_likelihood(SPHERE, shape, prior, beams, np.empty(len(beams.x)))
+    climbed(SPHERE, shape, prior[1] > 0.0, prior, beams, found)
     free, N = information(SPHERE, shape, prior, beams)
     invert(N, N)
     first, sigmas = int(np.searchsorted(free, NOISE)), prior[1, NOISE : FORM + 1]
     own = slice(first, first + len(sigmas))
-    return np.asarray(N[own, own] * sigmas[:, None] * sigmas)
+    return shape[NOISE : FORM + 1], np.asarray(N[own, own] * sigmas[:, None] * sigmas)
 
 
 def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tuple[Array, Array]:
@@ -85,6 +94,7 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
         is_begun = kind != SOLID and len(begun) > 0 and not np.isnan(begun[kind, 0])
         if is_begun:
             shape = begun[kind].copy()
+            shape[ALONG] = priors[kind, 0, ALONG]
             own = _evidence_nearby(kind, shape, priors[kind], beams)
             _keep(kind, shape, own + log_priors[kind], found, shapes)
         else:

@@ -29,11 +29,12 @@ SPHERE, BALL, BOULDER, HEAD, CYLINDER, POST, SOLID, PANEL, CLUTTER = range(len(N
 
 # Places of the parameters of a shape: centre, at the mean depth of its surface; logarithm of the
 # noise; half widths of a beam outside an outline where half the beams hit, before an empty sky and
-# before what sends an echo of its own; logarithm of a stretch of depths; up to ten of form; the
-# place of one face of the scan against the other; logarithm of the width of the pole over that of
-# what it holds; probability that a stone holds it, known beforehand
-X, Y, Z, NOISE, EDGE, STRETCH, FORM, SHIFT, POLE, STONE, N_PARAMETERS = (
-    *(0, 1, 2, 3, 4, 6, 7, 17, 20, 21, 22),
+# before what sends an echo of its own; logarithm of how much wider a beam is along the spin axis
+# than its data sheet says; that of a stretch of depths; up to ten of form; the place of one face of
+# the scan against the other; logarithm of the width of the pole over that of what it holds;
+# probability that a stone holds it, known beforehand
+X, Y, Z, NOISE, EDGE, ALONG, STRETCH, FORM, SHIFT, POLE, STONE, N_PARAMETERS = (
+    *(0, 1, 2, 3, 4, 6, 7, 8, 18, 21, 22, 23),
 )
 
 MEAN = 2.0 / 3.0  # of a radius: mean height of a sphere's surface over its disc
@@ -81,11 +82,19 @@ def _round(gap: float, radius: float, blur: float) -> float:
 
 
 @compiled
-def _beam(shape: Array, beams: Beams, i: int) -> _Beam:
+def _half_widths(shape: Array, beams: Beams) -> tuple[float, float]:
+    """Return half the width of a beam across and up."""
+    widths, wider = beams.widths, np.exp(shape[ALONG])
+    across = np.hypot(widths[0, 0], wider * widths[0, 1])
+    return across, np.hypot(widths[1, 0], wider * widths[1, 1])
+
+
+@compiled
+def _beam(shape: Array, blurs: tuple[float, float], beams: Beams, i: int) -> _Beam:
     """Return how far outside an outline a beam comes to hit, and half its width."""
     empty = beams.empty[i]
     edge = empty * shape[EDGE] + (1.0 - empty) * (shape[EDGE + 1] + beams.even[i])
-    return edge, beams.blur, beams.blur_up
+    return edge, blurs[0], blurs[1]
 
 
 @compiled
@@ -270,13 +279,13 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
     variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
     sigma = np.sqrt(variance)
     bottom = -form[1] if kind in (CYLINDER, POST) else -_POLE_FROM * form[0] * form[1]
-    hearing = (beams.lost, beams.faintest)
+    hearing, blurs = (beams.lost, beams.faintest), _half_widths(shape, beams)
     for i in range(len(beams.x)):
         x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
         y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
         moved = shape[Z] + beams.face[i] * shape[SHIFT + 2]
         z, down = beams.z[i] - moved, bottom - y
-        rest, beam = beams.behind[i], _beam(shape, beams, i)
+        rest, beam = beams.behind[i], _beam(shape, blurs, beams, i)
         if pole > 0.0 and down > 0.0:
             held = _on_pole(x, z - MEAN, pole, beam, sigma)
             rest = _stopped(rest, held, beams.z[i], beams.wide[i], hearing)
@@ -288,7 +297,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
         density = share * on + (1.0 - share) * rest
         densities[i] = _merged(density, merged, beams, i, surface) + _FLOOR
         if stone > 0.0 and down > 0.0:
-            held = _on_stone(x, z - MEAN, (down, down + _DIP * bottom), beams.blur)
+            held = _on_stone(x, z - MEAN, (down, down + _DIP * bottom), blurs[0])
             rest = _stopped(beams.behind[i], held, beams.z[i], beams.wide[i], hearing)
             density = share * on + (1.0 - share) * rest
             others[i] = _merged(density, merged, beams, i, surface) + _FLOOR
@@ -335,11 +344,11 @@ def _log_held(stone: float, gain: float, others: Array, densities: Array) -> flo
 @compiled
 def align(kind: int, shape: Array, beams: Beams) -> None:
     """Move a shape to the mean depth of the returns that it would explain."""
-    n, total, form = 0, 0.0, _form_of(kind, shape)
+    n, total, form, blurs = 0, 0.0, _form_of(kind, shape), _half_widths(shape, beams)
     for i in range(len(beams.x)):
         x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
         y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
-        share, depth, _ = _surface(kind, x, y, shape, form, _beam(shape, beams, i))
+        share, depth, _ = _surface(kind, x, y, shape, form, _beam(shape, blurs, beams, i))
         if share > 0.5 and abs(beams.z[i]) < 1.5:
             n += 1
             total += beams.z[i] - depth

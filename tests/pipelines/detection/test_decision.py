@@ -40,7 +40,7 @@ def evidence(n_past=150, **changes):
     seen = Evidence(
         n_on=70, n_before=0, below=below, brightness=50.0, n_distinct=70,
         rows=np.empty(0, np.int32), seen=np.empty((3, 0)), faces=np.empty(0),
-        strengths=np.empty(0), silent=None, blur=np.full(2, 0.015), height=np.nan,
+        strengths=np.empty(0), silent=None, widths=np.full((2, 2), 0.01), height=np.nan,
         sigma_height=np.inf,
     )  # fmt: skip
     return seen._replace(**changes)

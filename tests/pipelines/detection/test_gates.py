@@ -41,8 +41,7 @@ def beams_before_a_wall(rng, away, *, is_merged):
         even=0.0 * ones,
         away=away * ones,
         merged=0.0 * ones,
-        blur=BLUR,
-        blur_up=BLUR,
+        widths=np.array([[BLUR, 0.0], [BLUR, 0.0]]),
         lost=0.02,
         faintest=0.1,
     )

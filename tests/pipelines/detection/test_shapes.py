@@ -40,8 +40,7 @@ def beams_below(depths_of):
         even=0.0 * ones,
         away=40.0 * ones,
         merged=0.0 * ones,
-        blur=BLUR,
-        blur_up=BLUR,
+        widths=np.array([[BLUR, 0.0], [BLUR, 0.0]]),
         lost=0.02,
         faintest=0.5,
     )

@@ -45,8 +45,7 @@ def beams_at(rng, step):
         even=0.0 * ones,
         away=np.inf * ones,
         merged=0.0 * ones,
-        blur=0.05,
-        blur_up=0.05,
+        widths=np.array([[0.05, 0.0], [0.05, 0.0]]),
         lost=0.02,
         faintest=0.1,
     )
@@ -94,7 +93,7 @@ def test_the_likelihood_of_thousands_of_exact_ranges_is_finite():
     beams = beams_at(np.random.default_rng(3), 0.05)
     off = np.minimum(np.hypot(beams.x, beams.y), 1.0)
     beams = beams._replace(
-        z=np.where(beams.z < np.inf, -np.sqrt(1.0 - off**2), np.inf), blur=0.0, blur_up=0.0
+        z=np.where(beams.z < np.inf, -np.sqrt(1.0 - off**2), np.inf), widths=np.zeros((2, 2))
     )
     shape, densities = prior_of(())[0], np.empty(len(beams.x))
     shape[NOISE] = np.log(noise)
