@@ -324,10 +324,10 @@ def _log_prior(shape: Array, prior: Array) -> float:
 
 @compiled
 def _log_held(stone: float, gain: float, others: Array, densities: Array) -> float:
-    """Return the log odds by which beams are likelier if a stone may hold an object up.
+    """Return the logarithm of how much likelier beams are if a stone may hold an object up.
 
-    ``gain`` are those if one does, ``others`` the densities of the beams then, 0 for those above.
-    Weights the densities of both.
+    ``gain`` is that if one does, ``others`` the densities of the beams then, 0 for those above.
+    The densities become the means of both by how probable the stone is, in the logarithm.
     """
     if stone <= 0.0:
         return 0.0

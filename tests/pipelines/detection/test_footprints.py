@@ -89,7 +89,7 @@ def test_the_comparison_takes_the_width_along_the_axis_as_it_is_given():
     assert true > narrow + 10.0
 
 
-def test_a_sphere_alone_leaves_what_it_shares_where_it_was():
+def test_what_a_sphere_shares_is_estimated_without_changing_it():
     prior = prior_of()
     beams = beams_of(0.2, 0.1, np.random.default_rng(6))
     sphere = prior[0].copy()
