@@ -42,6 +42,9 @@ class Optics:
         has the second moments of an even one of that width.
     divergence_scale : float
         True divergence over the nominal one; 0 for beams without divergence.
+    roundness : float
+        What the divergence along the spin axis is multiplied by besides; with the nominal beam,
+        twice as wide across that axis as along it, 2 is a round one.
     window : (2,) of float
         Full width of the beam where it leaves, across and along the spin axis [m].
     incidence : float
@@ -70,6 +73,7 @@ class Optics:
 
     profile: Profile = Profile.EVEN
     divergence_scale: float = 1.0
+    roundness: float = 1.0
     window: tuple[float, float] = (0.0, 0.0)
     incidence: float = 0.0
     pick: Pick = Pick.STRONGEST

@@ -129,7 +129,7 @@ def true_rig(config: SimulationConfig, rng: np.random.Generator) -> Rig:
         name="true",
         T_head_lidar=T_head_lidar,
         laser_range_biases=optics.range_bias + of_lasers,
-        divergence=optics.divergence_scale * rig.divergence,
+        divergence=optics.divergence_scale * np.array([1.0, optics.roundness]) * rig.divergence,
         encoder_eccentricity=rng.normal(0.0, config.sigma_eccentricity, 2),
         gimbal_clock_offset=config.gimbal_clock_offset,
     )

@@ -75,6 +75,7 @@ PRIORS: Mapping[str, Prior] = {
     "softness": Prior((0.05, 0.3), (0.05, 0.5), False, _OPTICS, "of the threshold, ln(energy)"),
     "drop_out": Prior((0.001, 0.02), (0.001, 0.2), True, _OPTICS, "share of returns lost"),
     "divergence_scale": Prior((0.85, 1.15), (0.7, 1.3), False, _OPTICS, "true over nominal; or 0"),
+    "roundness": Prior((0.85, 1.18), (0.7, 2.0), True, _OPTICS, "width along the axis, true over"),
     "window": Prior((0.0, 0.5), (0.0, 1.0), False, _OPTICS, "beam there, of 12.7 x 9.5 mm"),
     "gate": Prior((0.1, 1.0), (0.05, 1.2), True, _OPTICS, "surfaces in one echo [m]"),
     # usual: in the mean of squares what the data sheet leaves, ``fitting.sigma_range_common``
@@ -129,7 +130,7 @@ _STOP_CLEAR = 0.9  # [m] from a stop to the nearest object
 _SPREAD = 4.8  # [m] of the stops about the first one
 _N_TRIES = 300
 _SKIRT = 150.0  # [m] half side of the ground
-_CONFIG, _LAYOUT, _ITEMS, _LAND = range(30, 34)  # random streams
+_CONFIG, _LAYOUT, _ITEMS, _LAND, _BEAM = range(30, 35)  # random streams
 _Values = Mapping[str, float]
 # Builders with the room that they need: metres, and radii of the markers.
 _ROUND = ((objects.a_round_rock, 0.0, 2.5), (objects.perched_rock, 0.0, 4.5))
@@ -222,7 +223,8 @@ def draw_world(seed: int, family: str = "") -> RandomWorld:
     if family not in FAMILIES:
         raise ConfigError(f"There is no family {family!r}; there are: {', '.join(FAMILIES)}.")
     rng = np.random.default_rng([seed, _CONFIG])
-    values = {name: prior.draw(rng, family) for name, prior in PRIORS.items()}
+    streams = {"roundness": np.random.default_rng([seed, _BEAM])}  # all else is as without it
+    values = {name: one.draw(streams.get(name, rng), family) for name, one in PRIORS.items()}
     config = _config(rng, values, family)
     field = _field(values, seed, family, config)
     return RandomWorld(field=field, config=config)
@@ -287,7 +289,7 @@ def _optics(rng: np.random.Generator, values: _Values, family: str) -> Optics:
         range_bias=rng.normal(0.0, values["range_bias"]),
         dust=_between(rng, _DUST) if family == "dust" else 0.0,
         strays=_STRAYS if family in ("dust", _ALL) else 0.0,
-        **{name: values[name] for name in ("gate", "range_half", "softness")},
+        **{name: values[name] for name in ("roundness", "gate", "range_half", "softness")},
     )
 
 

@@ -11,8 +11,8 @@ from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.model import RING_UNKNOWN
 from spheremark.pipelines.scan.rigs import rig_digest
 from spheremark.pipelines.simulation import FAMILIES, commensurability, draw_world, random_world
-from spheremark.pipelines.simulation.options import Profile
-from spheremark.pipelines.simulation.rig import nominal_rig
+from spheremark.pipelines.simulation.options import Optics, Profile, SimulationConfig
+from spheremark.pipelines.simulation.rig import nominal_rig, true_rig
 from spheremark.pipelines.simulation.worlds import PRIORS, family_of
 from spheremark.storage.recordings import write_log
 
@@ -74,6 +74,19 @@ def test_every_quantity_has_a_prior_that_widens_in_its_families():
         rng = np.random.default_rng(0)
         drawn = [prior.draw(rng, "plain") for _ in range(200)]
         assert prior.usual[0] <= min(drawn) < max(drawn) <= prior.usual[1], name
+
+
+def test_beams_are_drawn_rounder_and_flatter_than_by_the_data_sheet():
+    def drawn(family):
+        return np.log([draw_world(seed, family).config.optics.roundness for seed in range(40)])
+
+    usual, wide = drawn("plain"), drawn("optics")
+    assert abs(usual).max() < 0.2
+    assert wide.min() < -0.2
+    assert wide.max() > 0.5
+    config = SimulationConfig(optics=Optics(divergence_scale=1.2, roundness=1.5))
+    true, by_sheet = true_rig(config, np.random.default_rng(1)), nominal_rig(config)
+    assert true.divergence == pytest.approx(by_sheet.divergence * [1.2, 1.8])
 
 
 def test_radii_go_from_three_centimetres_to_two_and_a_half_metres_at_fitting_distances():
