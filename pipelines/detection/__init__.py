@@ -85,15 +85,13 @@ _N_REJECTED, _N_NOT_COMPARED = 200, 100  # groups, the likeliest first, kept wit
 _SIGMAS_LOG_NOISE = (0.3, 0.6)  # of one marker about the others of a scan; of a scan about a group
 
 _N_ABOUT = 16  # returns about a refused group that show where it is by another mounting
-_NEARBY = 1.0  # [m] beyond two radii within which other groups show leaves, walls and fences
 
 
 class _Compared(NamedTuple):
-    """A group that is compared: its features, its evidence, and how many others stand near it."""
+    """A group that is compared: its features and its evidence."""
 
     features: Features
     evidence: Evidence
-    n_neighbours: int
 
 
 _Group = tuple[_Compared, Judgement, Array]
@@ -192,7 +190,6 @@ def _sifted(
 ) -> tuple[list[_Compared], list[Rejection], Hearing]:
     """Return the groups to compare; the others, those that came farthest first; the hearing."""
     reasons = [reason_by_features(features, target.radius) for features in groups]
-    near = _n_neighbours(groups, target.radius)
     passed = [i for i, reason in enumerate(reasons) if not reason]
     centres = np.array([groups[i].p_base for i in passed]).reshape(-1, 3)
     gathered, hearing = gather_evidence(cloud, *known, centres, target)
@@ -202,7 +199,7 @@ def _sifted(
         if reason:
             rejected.append(_rejection(groups[i], reason))
             continue
-        compared.append(_Compared(groups[i], evidence, near[i]))
+        compared.append(_Compared(groups[i], evidence))
     rejected += [_rejection(groups[i], reason) for i, reason in enumerate(reasons) if reason]
     return compared, rejected, hearing
 
@@ -232,15 +229,6 @@ def _moved_back(found: MarkerCandidates, points: Column, others: Column) -> Mark
     )
 
 
-def _n_neighbours(groups: list[Features], radius: float) -> list[int]:
-    """Return how many other groups stand near each."""
-    if not groups:
-        return []
-    tree = KDTree(np.array([features.p_base for features in groups]))
-    near = tree.query_ball_point(tree.data, _NEARBY + 2.0 * radius, return_length=True)
-    return list((np.asarray(near) - 1).tolist())
-
-
 def _rejection(features: Features, reason: str) -> Rejection:
     """Return a group that is not used."""
     return Rejection(p_base=features.p_base, n_points=features.n_points, reason=reason)
@@ -267,9 +255,9 @@ def _log_likelihoods(
 
     def compare(rows: Sequence[int]) -> None:
         for i in rows:
-            features, evidence, n_neighbours = compared[i]
+            features, evidence = compared[i]
             found[i], shared[i], covs[i], shapes[i], by_gate[i] = log_likelihoods(
-                evidence, features.p_base, target, n_neighbours, physics[i], shapes[i]
+                evidence, features.p_base, target, physics[i], shapes[i]
             )
 
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)

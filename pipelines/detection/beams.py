@@ -83,8 +83,8 @@ class Beams(NamedTuple):
 
 def beams_about(
     evidence: Evidence, radius: float, strength: float, hearing: tuple[float, float], n_most: int
-) -> tuple[Beams, int, int]:
-    """Return the beams that are compared, and how many beside the object end near or go past.
+) -> Beams:
+    """Return the beams that are compared.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def beams_about(
     behind = share * _density_near(every[:3, kept], every[:3, is_high & is_near])
     behind, wide = _behind(every[:3, kept], every[:3, is_low], (behind, 1.0 - share))
     empty, even, away = _beside(every[:, kept], every[:, is_beside], strength)
-    beams = Beams(
+    return Beams(
         x=x[kept],
         y=y[kept],
         z=z[kept],
@@ -130,7 +130,6 @@ def beams_about(
         lost=hearing[0],
         faintest=hearing[1],
     )
-    return beams, n_near, n_past
 
 
 def _every_beam(evidence: Evidence, radius: float) -> Array:

@@ -1,11 +1,11 @@
 """The hypotheses about a place, and how likely each is given all beams about it.
 
-Hides their priors, and what beams beside a place, its height and its neighbours show.
+Hides their priors, and what the height of a place shows.
 """
 
 from __future__ import annotations
 
-from math import erfc, exp, hypot, lgamma
+from math import erfc, exp, hypot
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -38,13 +38,7 @@ from spheremark.pipelines.detection.shapes import (
     Z,
     log_likelihood,
 )
-from spheremark.pipelines.detection.support import (
-    ANY,
-    OPEN,
-    STANDING,
-    log_share,
-    log_supports,
-)
+from spheremark.pipelines.detection.support import STANDING, log_supports
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
@@ -82,7 +76,6 @@ held up: the usual abundance of what stands free."""
 ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
 """Groups of each hypothesis that something wide holds up, or the ground, in as many worlds."""
 
-_BESIDE = 0.1  # probability of anything beside what stands free
 _HEIGHTS, _TALLER = 2.5, 1.0  # [m] up to which markers stand; and how much higher, if they do
 _ON_WIDE, _WIDE = 0.1, 0.4  # probability of standing on something wide, and how high that is [m]
 _ON_STONE = 0.25  # of what stands on something wide or on the ground, on a stone
@@ -91,10 +84,6 @@ _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard dev
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
 _HEAD_HEIGHT, _LOWERED = (1.6, 0.12), 0.2  # [m] of adults who stand (1.70 m tall); share of others
 _NOT_GROUND = 0.02  # probability that the ground about a place is not what it stands on
-
-_N_NEAR_FREE = 0.2  # groups near what stands free, in the mean
-_CROWDED = 5.0 / 6.0  # odds of one more group near leaves, panels and posts: five in the mean
-_AMONG = 0.03  # probability that what stands free stands among these
 
 
 class Physics(NamedTuple):
@@ -135,7 +124,6 @@ def log_likelihoods(
     evidence: Evidence,
     centre: Array,
     target: Target,
-    n_neighbours: int,
     physics: Physics,
     begun: Array,
 ) -> tuple[Array, Array, Array, Array, Array]:
@@ -149,8 +137,6 @@ def log_likelihoods(
         The place, in base [m].
     target : Target
         What is searched for.
-    n_neighbours : int
-        Other groups that stand near it.
     physics : Physics
         Of the scan.
     begun : (k, p)
@@ -172,16 +158,14 @@ def log_likelihoods(
     strength = max(evidence.brightness, 1.0) / distance**2
     faintest = min(max(physics.weakest / strength, _FLOOR), _HEARD)  # its own returns are heard
     hearing, n_most = (physics.lost, faintest), _N_BEAMS[int(len(begun) > 0)]
-    beams, n_beside, n_passing = beams_about(evidence, radius, strength, hearing, n_most)
+    beams = beams_about(evidence, radius, strength, hearing, n_most)
     beams = merged_within(beams, physics.gates, radius)
     standing = _standing_densities(evidence.height, evidence.sigma_height, radius)
     lying = _boulder_densities(evidence.height, evidence.sigma_height, radius)
     held, perched = (own[1] / sum(own) for own in (standing, lying))
     logs = log_supports(evidence, float(centre @ target.up), radius, held, perched)
     for kind in range(len(NAMES)):
-        logs[kind] += _log_beside(kind, n_beside, n_passing)
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
-        logs[kind] += np.log(_neighbour_probability(kind, n_neighbours))
     priors = _priors(radius, physics)
     priors[STANDING, 0, STONE], priors[BOULDER, 0, STONE] = np.round((_ON_STONE * held, perched), 2)
     if abs(beams.face.sum()) < 0.5 * len(beams.face) - 3:
@@ -219,24 +203,6 @@ def _priors(radius: float, physics: Physics) -> Array:
     priors[[BOULDER, HEAD], :, NOISE] = np.log(rough), _SIGMA_LOG_RELIEF
     priors[CLUTTER, 1, NOISE] = 0.0  # its own scatter is a parameter of form
     return priors
-
-
-def _log_beside(kind: int, n_near: int, n_past: int) -> float:
-    """Return the log probability of the beams beside an object."""
-    anything = float(log_share(n_near, n_past, ANY))
-    if kind in (PANEL, CLUTTER):
-        return anything
-    nothing = log_share(n_near, n_past, OPEN) + np.log(1.0 - _BESIDE)
-    return float(np.logaddexp(nothing, anything + np.log(_BESIDE)))
-
-
-def _neighbour_probability(kind: int, n: int) -> float:
-    """Return the probability of so many other groups nearby: crowns, walls and fences have many."""
-    crowded = (1.0 - _CROWDED) * _CROWDED**n
-    if kind in (POST, PANEL, CLUTTER):
-        return crowded
-    alone = exp(n * np.log(_N_NEAR_FREE) - _N_NEAR_FREE - lgamma(n + 1))
-    return _AMONG * crowded + (1.0 - _AMONG) * alone
 
 
 def _height_density(kind: int, height: float, sigma: float, radius: float) -> float:
