@@ -25,11 +25,11 @@ from spheremark.pipelines.detection.shapes import (
 from spheremark.pipelines.detection.target import ASIDE
 from spheremark.pipelines.model import Array
 
-OPEN, CLOSED, ANY = (0.3, 5.0), (5.0, 0.3), (0.5, 0.5)
-"""Beta distributions of the share of beams that end near, where nothing is, something, anything."""
-
 STANDING = (SPHERE, BALL, CYLINDER, SOLID)
 """Hypotheses of what stands on a pole or on something wide, or lies on the ground."""
+
+# Beta distributions of the share of beams that end near, where nothing is, something, anything
+_OPEN, _CLOSED, _ANY = (0.3, 5.0), (5.0, 0.3), (0.5, 0.5)
 
 _NEIGHBOUR = 0.05  # probability that something else stands on one side, but for the ground
 _DOUBT = 0.1  # probability of anything below what stands on a pole or on something wide
@@ -120,7 +120,7 @@ def _log_supports(near: Array, past: Array, supports: Array) -> Array:
             continue
         logs[kind] += log(1.0 - _NEIGHBOUR)
         for side in range(2):
-            neighbour = log_share(near[1 - side].sum(), past[1 - side].sum(), ANY)
+            neighbour = _log_share(near[1 - side].sum(), past[1 - side].sum(), _ANY)
             alone = _log_support(near[side], past[side], support) + neighbour
             logs[kind] = np.logaddexp(logs[kind], alone + log(0.5 * _NEIGHBOUR))
     return logs
@@ -130,19 +130,19 @@ def _log_supports(near: Array, past: Array, supports: Array) -> Array:
 def _log_support(near: Array, past: Array, support: Array) -> float:
     """Return the log probability of the beams of some rows, by what holds a place up."""
     n_near, n_past = near.sum(), past.sum()
-    found = log(support[0]) + log_share(n_near, n_past, OPEN)
-    found = np.logaddexp(found, log(support[1]) + log_share(n_near, n_past, ANY))
+    found = log(support[0]) + _log_share(n_near, n_past, _OPEN)
+    found = np.logaddexp(found, log(support[1]) + _log_share(n_near, n_past, _ANY))
     over, passed = 0.0, 0.0
     for row in range(len(near)):
         if support[2 + row] > 0.0:
-            begun = log(support[2 + row]) + log_share(over, passed, OPEN)
-            found = np.logaddexp(found, begun + log_share(n_near - over, n_past - passed, CLOSED))
+            begun = log(support[2 + row]) + _log_share(over, passed, _OPEN)
+            found = np.logaddexp(found, begun + _log_share(n_near - over, n_past - passed, _CLOSED))
         over, passed = over + near[row], passed + past[row]
     return float(found)
 
 
 @compiled
-def log_share(n_near: float, n_past: float, beta: tuple[float, float]) -> float:
+def _log_share(n_near: float, n_past: float, beta: tuple[float, float]) -> float:
     """Return the log probability that so many beams end near, and so many go past."""
     a, b = beta
     begun = lgamma(a + b) - lgamma(a) - lgamma(b)

@@ -82,7 +82,7 @@ def test_a_cloud_that_cannot_be_used_is_refused_with_what_was_found(change, sent
 
 
 def test_scans_are_processed_and_adjusted_with_two_calls():
-    quick, seeds, squares = SimulationConfig(only_near_spheres=True), (2, 4, 6), []
+    quick, seeds, squares = SimulationConfig(only_near_spheres=True), (2, 4, 6, 8, 11, 12), []
     for seed in seeds:
         field = scenario("paper-field", seed)
         made = [simulate_stop(field, stop.name, quick) for stop in field.stops[:2]]

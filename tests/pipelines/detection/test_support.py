@@ -8,7 +8,7 @@ from scipy.stats import betabinom
 
 from spheremark.pipelines.detection.evidence import N_ROWS
 from spheremark.pipelines.detection.shapes import BOULDER, HEAD, SPHERE
-from spheremark.pipelines.detection.support import _log_supports, log_share, supports_of
+from spheremark.pipelines.detection.support import _log_share, _log_supports, supports_of
 
 N = 10  # beams in each row on each side
 ON_POLES, ON_WIDE = supports_of(0.05, 1.0), supports_of(0.6, 1.0)  # as high as poles, and crates
@@ -29,7 +29,7 @@ def logs_by(supports, near):
 def test_a_share_of_beams_has_the_probability_of_one_order_of_a_beta_binomial(n_near, n_past):
     n = n_near + n_past
     expected = betabinom.logpmf(n_near, n, 0.3, 5.0) - np.log(comb(n, n_near))
-    assert log_share(n_near, n_past, (0.3, 5.0)) == pytest.approx(expected, abs=1e-9)
+    assert _log_share(n_near, n_past, (0.3, 5.0)) == pytest.approx(expected, abs=1e-9)
 
 
 def test_legs_that_spread_are_no_shoulders_though_they_stop_as_many_beams():
