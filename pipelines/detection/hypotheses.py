@@ -38,7 +38,7 @@ from spheremark.pipelines.detection.shapes import (
     Z,
     log_likelihood,
 )
-from spheremark.pipelines.detection.support import STANDING, log_supports
+from spheremark.pipelines.detection.support import log_supports
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 
@@ -46,6 +46,8 @@ _FLOOR = 1e-9
 _HEARD = 0.5  # of a beam: an object that is heard at all needs no larger share
 _N_BEAMS = (192, 400)  # that are compared at most: to find shapes, and where they are known
 _NEVER = 60.0  # logarithm of odds behind the best that stand for any more
+
+_STAND = (SPHERE, BALL, CYLINDER, SOLID)  # on a pole or on something wide, or on the ground
 
 # Means and standard deviations of the parameters
 _CENTRE, _POLE_SIZE = (0.3, 0.3, 0.4), (float(np.log(0.2)), 0.8)
@@ -167,7 +169,7 @@ def log_likelihoods(
     for kind in range(len(NAMES)):
         logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
     priors = _priors(radius, physics)
-    priors[STANDING, 0, STONE], priors[BOULDER, 0, STONE] = np.round((_ON_STONE * held, perched), 2)
+    priors[_STAND, 0, STONE], priors[BOULDER, 0, STONE] = np.round((_ON_STONE * held, perched), 2)
     if abs(beams.face.sum()) < 0.5 * len(beams.face) - 3:
         moved = MOVED / radius
         priors[SPHERE, 1, SHIFT:POLE] = moved
@@ -208,7 +210,7 @@ def _priors(radius: float, physics: Physics) -> Array:
 def _height_density(kind: int, height: float, sigma: float, radius: float) -> float:
     """Return the density of the height of a centre above the ground about it [1/m]."""
     unknown = 1.0 / _HEIGHTS
-    if kind in STANDING:
+    if kind in _STAND:
         share = _share_as_high(height - radius - sigma) if kind == SPHERE else 1.0
         return sum(_standing_densities(height, sigma, radius, share))
     if kind == BOULDER:

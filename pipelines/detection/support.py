@@ -13,25 +13,14 @@ import numpy as np
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.beams import BELOW
 from spheremark.pipelines.detection.evidence import Evidence, beside_pole
-from spheremark.pipelines.detection.shapes import (
-    BALL,
-    BOULDER,
-    CYLINDER,
-    HEAD,
-    NAMES,
-    SOLID,
-    SPHERE,
-)
+from spheremark.pipelines.detection.shapes import BOULDER, HEAD, NAMES
 from spheremark.pipelines.detection.target import ASIDE
 from spheremark.pipelines.model import Array
-
-STANDING = (SPHERE, BALL, CYLINDER, SOLID)
-"""Hypotheses of what stands on a pole or on something wide, or lies on the ground."""
 
 # Beta distributions of the share of beams that end near, where nothing is, something, anything
 _OPEN, _CLOSED, _ANY = (0.3, 5.0), (5.0, 0.3), (0.5, 0.5)
 
-_NEIGHBOUR = 0.05  # probability that something else stands on one side, but for the ground
+_NEIGHBOUR = 0.05  # probability that something else stands on one side of what is not on the ground
 _DOUBT = 0.1  # probability of anything below what stands on a pole or on something wide
 _ROWS = np.array([0.0, *(0.2,) * 3, *(0.08,) * 5])
 """Probabilities of the row from which something wide stops the beams below what stands on it: it
@@ -41,7 +30,6 @@ begins there, or widens farther down, as a cone does or a tripod."""
 # shoulders begin within three radii below a head
 _GROUND = (0.005, 0.005, *(0.2475,) * 4, *(0.0,) * 5)
 _SHOULDERS = (0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0)
-_ANYTHING = (0.05, 0.9, 0.0, *(0.00625,) * 8)
 
 
 def log_supports(
@@ -66,20 +54,27 @@ def log_supports(
     -----
     Shares of beams are Beta distributed, their counts Beta-binomial; the row from which something
     stops them is marginalised. Both sides show what holds it up, or one does and the other shows a
-    neighbour; the ground is on both.
+    neighbour; the ground is on both. What is neither a boulder nor a head is held as a sphere is.
     """
-    supports = supports_of(held, perched)
-    return np.asarray(_log_supports(*_beams_below(evidence, level, radius), supports))
+    return _log_supports(*_beams_below(evidence, level, radius), supports_of(held, perched))
 
 
 def supports_of(held: float, perched: float) -> Array:
-    """Return the probabilities of what is below by all hypotheses, (k, 2 + 9), as ``_ANYTHING``."""
+    """Return the probabilities of what is below a sphere, a boulder and a head, as ``_GROUND``."""
     on_wide = np.array([0.0, _DOUBT, *((1.0 - _DOUBT) * _ROWS)])
     stands = held * on_wide
     stands[:2] = (1.0 - _DOUBT) * (1.0 - held), _DOUBT
     boulder = perched * on_wide + (1.0 - perched) * np.array(_GROUND)
-    supports = {BOULDER: boulder, HEAD: _SHOULDERS, **dict.fromkeys(STANDING, stands)}
-    return np.array([supports.get(kind, _ANYTHING) for kind in range(len(NAMES))])
+    return np.array([stands, boulder, _SHOULDERS])
+
+
+def _log_supports(near: Array, past: Array, supports: Array) -> Array:
+    """Return the log probabilities of beams to the left and to the right, by rows, (2, 9)."""
+    stands, boulder, head = supports
+    logs = np.full(len(NAMES), _log_supported(near, past, stands, _NEIGHBOUR))
+    logs[BOULDER] = _log_supported(near, past, boulder, 0.0)
+    logs[HEAD] = _log_supported(near, past, head, _NEIGHBOUR)
+    return logs
 
 
 def _beams_below(evidence: Evidence, level: float, radius: float) -> tuple[Array, Array]:
@@ -110,20 +105,18 @@ def _n_unknown(evidence: Evidence, level: float, radius: float) -> float:
 
 
 @compiled
-def _log_supports(near: Array, past: Array, supports: Array) -> Array:
-    """Return the log probabilities of beams to the left and to the right, by rows, (2, 9)."""
-    logs = np.empty(len(supports))
-    for kind in range(len(supports)):
-        support = supports[kind]
-        logs[kind] = _log_support(near[0] + near[1], past[0] + past[1], support)
-        if kind == BOULDER:
-            continue
-        logs[kind] += log(1.0 - _NEIGHBOUR)
-        for side in range(2):
-            neighbour = _log_share(near[1 - side].sum(), past[1 - side].sum(), _ANY)
-            alone = _log_support(near[side], past[side], support) + neighbour
-            logs[kind] = np.logaddexp(logs[kind], alone + log(0.5 * _NEIGHBOUR))
-    return logs
+def _log_supported(near: Array, past: Array, support: Array, neighbour: float) -> float:
+    """Return the log probability of all beams, by what holds a place up.
+
+    ``neighbour`` is the probability that one side shows something else.
+    """
+    found = _log_support(near[0] + near[1], past[0] + past[1], support) + log(1.0 - neighbour)
+    for side in range(2):
+        if neighbour > 0.0:
+            other = _log_share(near[1 - side].sum(), past[1 - side].sum(), _ANY)
+            alone = _log_support(near[side], past[side], support) + log(0.5 * neighbour)
+            found = np.logaddexp(found, alone + other)
+    return float(found)
 
 
 @compiled

@@ -70,6 +70,12 @@ def test_what_is_wide_from_under_it_on_is_rather_a_crate_where_these_are_as_high
     assert low[SPHERE] - low[HEAD] > high[SPHERE] - high[HEAD] + 2.0
 
 
+def test_what_is_neither_a_boulder_nor_a_head_is_held_as_a_sphere_is():
+    for near in ([0] * N_ROWS, [0, 0, 2, 5, 1, 8, 0, 3, 4], [N] * N_ROWS):
+        others = np.delete(logs(*near), (BOULDER, HEAD))
+        np.testing.assert_array_equal(others, others[SPHERE])
+
+
 def test_without_beams_below_nothing_is_known():
     nothing = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)), ON_POLES)
     np.testing.assert_allclose(nothing, 0.0, atol=1e-9)
