@@ -20,7 +20,7 @@ from spheremark.pipelines.model import Array
 # Beta distributions of the share of beams that end near, where nothing is, something, anything
 _OPEN, _CLOSED, _ANY = (0.3, 5.0), (5.0, 0.3), (0.5, 0.5)
 
-_NEIGHBOUR = 0.05  # probability that something else stands on one side of what is not on the ground
+_NEIGHBOUR = 0.05  # probability that something else is on one side; a boulder has ground on both
 _DOUBT = 0.1  # probability of anything below what stands on a pole or on something wide
 _ROWS = np.array([0.0, *(0.2,) * 3, *(0.08,) * 5])
 """Probabilities of the row from which something wide stops the beams below what stands on it: it
@@ -60,7 +60,10 @@ def log_supports(
 
 
 def supports_of(held: float, perched: float) -> Array:
-    """Return the probabilities of what is below a sphere, a boulder and a head, as ``_GROUND``."""
+    """Return the probabilities of what is below a sphere, a boulder and a head, (3, 2 + 9).
+
+    Of nothing, of anything, and of something from each row down. Arguments as in ``log_supports``.
+    """
     on_wide = np.array([0.0, _DOUBT, *((1.0 - _DOUBT) * _ROWS)])
     stands = held * on_wide
     stands[:2] = (1.0 - _DOUBT) * (1.0 - held), _DOUBT
@@ -69,7 +72,7 @@ def supports_of(held: float, perched: float) -> Array:
 
 
 def _log_supports(near: Array, past: Array, supports: Array) -> Array:
-    """Return the log probabilities of beams to the left and to the right, by rows, (2, 9)."""
+    """Return the log probabilities of beams, left and right by rows (2, 9), by hypotheses (k,)."""
     stands, boulder, head = supports
     logs = np.full(len(NAMES), _log_supported(near, past, stands, _NEIGHBOUR))
     logs[BOULDER] = _log_supported(near, past, boulder, 0.0)
