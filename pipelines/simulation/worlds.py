@@ -75,7 +75,9 @@ PRIORS: Mapping[str, Prior] = {
     "softness": Prior((0.05, 0.3), (0.05, 0.5), False, _OPTICS, "of the threshold, ln(energy)"),
     "drop_out": Prior((0.001, 0.02), (0.001, 0.2), True, _OPTICS, "share of returns lost"),
     "divergence_scale": Prior((0.85, 1.15), (0.7, 1.3), False, _OPTICS, "true over nominal; or 0"),
-    "roundness": Prior((0.85, 1.18), (0.7, 2.0), True, _OPTICS, "along the spin axis, besides"),
+    "roundness": Prior(
+        (0.85, 1.18), (0.7, 2.0), True, _OPTICS, "as much wider along the spin axis"
+    ),
     "window": Prior((0.0, 0.5), (0.0, 1.0), False, _OPTICS, "beam there, of 12.7 x 9.5 mm"),
     "gate": Prior((0.1, 1.0), (0.05, 1.2), True, _OPTICS, "surfaces in one echo [m]"),
     # usual: in the mean of squares what the data sheet leaves, ``fitting.sigma_range_common``
