@@ -12,7 +12,9 @@ from spheremark.pipelines.model import Array, Index, StitchedCloud
 from spheremark.pipelines.scan.firings import Clock, in_base, numbers_of, pulses_about, pulses_of
 from spheremark.pipelines.scan.rigs import N_LASERS
 
-_REACH = 3.0  # radii about a place
+REACH = 3.0
+"""Radii about a place within which its pulses without a return are known."""
+
 _N_SAMPLES, _N_SAMPLE = 300, 100  # samples of so many returns that follow each other
 _GROUND = (0.25, 0.55)  # sines of the angles below the horizon where the ground is near
 _N_SECTORS, _N_IN_SECTOR = 24, 20  # of azimuth, and pulses that show one
@@ -24,7 +26,7 @@ def unheard_about(clock: Clock, heard: Index, c: Array, target: Target) -> Array
 
     ``heard`` are the numbers of all others: what stands long before a place hides it.
     """
-    pulses, passing, _ = pulses_about(clock, c, _REACH * target.radius)
+    pulses, passing, _ = pulses_about(clock, c, REACH * target.radius)
     rows = np.searchsorted(heard, pulses.numbers).clip(max=len(heard) - 1)
     found = heard[rows] != pulses.numbers
     view, angles = view_of(c, target.up), pulses.angles[found]

@@ -12,7 +12,8 @@ import numpy as np
 
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.beams import BELOW
-from spheremark.pipelines.detection.evidence import Evidence, beside_pole
+from spheremark.pipelines.detection.evidence import N_ROWS, ROW, Evidence, beside_pole
+from spheremark.pipelines.detection.pulses import REACH
 from spheremark.pipelines.detection.shapes import BOULDER, HEAD, NAMES
 from spheremark.pipelines.detection.target import ASIDE
 from spheremark.pipelines.model import Array
@@ -86,25 +87,33 @@ def _beams_below(evidence: Evidence, level: float, radius: float) -> tuple[Array
     n_past = past.sum()
     if evidence.silent is None:  # pulses are as dense below, and those without a return go past
         return near, past + max(evidence.n_on - near.sum() - n_past, 0.0) / past.size
-    n_unknown = _n_unknown(evidence, level, radius)
-    return near, past * max(1.0 - n_unknown / max(n_past, 1.0), 0.0)
+    return near, past - _n_unknown(evidence, level, radius)
 
 
-def _n_unknown(evidence: Evidence, level: float, radius: float) -> float:
-    """Return how many pulses without a return below a place may have met ground that is not heard.
+def _n_unknown(evidence: Evidence, level: float, radius: float) -> Array:
+    """Return how many pulses without a return below a place may have met unheard ground, (2, 9).
 
-    The beams to the sides, past where a pole or shoulders would be, show how much of it is heard.
-    No ground is above the horizon, in the mean.
+    The beams farther to the same side, past where a pole or shoulders would be, show how much of it
+    is heard as far down. No ground is above the horizon, in the mean.
     """
     assert evidence.silent is not None
     silent = evidence.silent[:2, evidence.silent[1] < -level] / radius
     blur = evidence.blur.max() / radius
-    n_heard, n_silent = (
-        int(np.sum((up < BELOW) & (abs(across) > ASIDE + blur)))
-        for across, up in (evidence.seen[:2] / radius, silent)
-    )
-    n_below = beside_pole(silent, blur).sum()
-    return float(n_below * (n_silent + 0.5) / (n_heard + n_silent + 1.0))
+    n_heard, n_silent = (_n_aside(own, blur) for own in (evidence.seen[:2] / radius, silent))
+    share = (n_silent.sum() + 0.5) / (n_heard.sum() + n_silent.sum() + 1.0)
+    shares = (n_silent + share) / (n_heard + n_silent + 1.0)
+    return np.asarray(beside_pole(silent, blur) * shares)
+
+
+@compiled
+def _n_aside(passing: Array, blur: float) -> Array:
+    """Return how many beams pass to a side, below a place and past what may hold it, (2, 9)."""
+    n = np.zeros((2, N_ROWS))
+    for i in range(passing.shape[1]):
+        across, up = passing[0, i], passing[1, i]
+        if up < BELOW and abs(across) > ASIDE + blur and across * across + up * up < REACH * REACH:
+            n[int(across > 0.0), min(int(-up / ROW), N_ROWS - 1)] += 1.0
+    return n
 
 
 @compiled

@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import betabinom
 
-from spheremark.pipelines.detection.evidence import N_ROWS
+from spheremark.pipelines.detection.evidence import N_ROWS, Evidence, beside_pole
 from spheremark.pipelines.detection.shapes import BOULDER, HEAD, SPHERE
-from spheremark.pipelines.detection.support import _log_share, _log_supports, supports_of
+from spheremark.pipelines.detection.support import (
+    _beams_below,
+    _log_share,
+    _log_supports,
+    supports_of,
+)
 
 N = 10  # beams in each row on each side
 ON_POLES, ON_WIDE = supports_of(0.05, 1.0), supports_of(0.6, 1.0)  # as high as poles, and crates
@@ -79,3 +84,31 @@ def test_what_is_neither_a_boulder_nor_a_head_is_held_as_a_sphere_is():
 def test_without_beams_below_nothing_is_known():
     nothing = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)), ON_POLES)
     np.testing.assert_allclose(nothing, 0.0, atol=1e-9)
+
+
+def beams_below(level):
+    """Silent beams below a place, by sides, and how many of them are known to go past.
+
+    Ground is heard far to the left of it, and to the right where silent pulses are not known.
+    """
+    x, y = np.mgrid[-3.95:4.0:0.1, -2.5:-0.3:0.1].reshape(2, -1)
+    is_heard = (x < -2.0) | (np.hypot(x, y) > 3.0)
+    silent = np.array([x, y, 0.5 * np.ones(len(x))])[:, ~is_heard]
+    below = np.array([np.zeros((2, N_ROWS), np.int64), beside_pole(silent, 0.1)])
+    seen = Evidence(
+        n_on=70, n_before=0, below=below, brightness=50.0, n_distinct=70,
+        rows=np.empty(0, np.int32), seen=np.array([x, y, 0.0 * x])[:, is_heard], faces=np.empty(0),
+        strengths=np.empty(0), silent=silent, widths=np.array([[0.1, 0.0], [0.1, 0.0]]),
+    )  # fmt: skip
+    return below[1], _beams_below(seen, level, 1.0)[1]
+
+
+def test_silence_below_shows_a_pole_only_where_ground_beside_it_is_heard():
+    silent, past = beams_below(-5.0)
+    assert past[0].sum() > 0.9 * silent[0].sum()
+    assert past[1].sum() < 0.1 * silent[1].sum()
+
+
+def test_silence_above_the_horizon_is_the_sky():
+    silent, past = beams_below(5.0)
+    np.testing.assert_array_equal(past, silent)
