@@ -37,12 +37,14 @@ from spheremark.pipelines.detection.decision import (
     distinct,
     gates_of,
     is_resolved,
-    judged,
+    judgement_of,
     noise_of,
     paint_of,
+    posteriors_of,
     reason_by_evidence,
     reason_by_features,
     shared_of,
+    stones_of,
     sure_ones,
 )
 from spheremark.pipelines.detection.evidence import Evidence, gather_evidence
@@ -56,13 +58,23 @@ from spheremark.pipelines.detection.features import (
 from spheremark.pipelines.detection.ground import Ground, ground_of
 from spheremark.pipelines.detection.hypotheses import (
     SIGMAS,
+    STONES,
     USUAL,
     Physics,
     log_likelihoods,
+    usual_stones,
 )
 from spheremark.pipelines.detection.pulses import Hearing
 from spheremark.pipelines.detection.seeds import find_seeds
-from spheremark.pipelines.detection.shapes import N_PARAMETERS, NAMES, POLE, SHIFT, SPHERE
+from spheremark.pipelines.detection.shapes import (
+    BOULDER,
+    N_PARAMETERS,
+    NAMES,
+    NOISE,
+    POLE,
+    SHIFT,
+    SPHERE,
+)
 from spheremark.pipelines.detection.target import Target, blur_at
 from spheremark.pipelines.model import (
     Array,
@@ -150,10 +162,10 @@ def _extracted(
     compared, not_compared, hearing = _sifted(groups, cloud, (cells, ground), target)
     noise = noise_of([one.features for one in compared if one.evidence.shows_below], target.radius)
     logs, shifts = _log_likelihoods(compared, noise, hearing, config, target)
-    by_shape = [judgement.probability for judgement in _judged(compared, logs, marker_radius)]
+    by_shape = np.exp(_posteriors(compared, logs, marker_radius)[:, SPHERE]).tolist()
     log_ratios, by_paint = paint_of([one.evidence for one in compared], by_shape)
     logs[:, 0] += log_ratios
-    judgements = _judged(compared, logs, marker_radius)
+    judgements = [judgement_of(own, NAMES) for own in _posteriors(compared, logs, marker_radius)]
     is_sure = sure_ones([one.probability for one in judgements], config.false_rate)
     markers, possible, rejected = list[_Group](), list[Rejection](), list[Rejection]()
     for one, judgement, paint, sure, own in zip(
@@ -245,13 +257,13 @@ def _log_likelihoods(
 
     And how far apart the faces show the best spheres, (n, 3) radii; zero where one does alone. What
     markers have in common, as noise, where beams come to hit an outline and how far echoes merge,
-    is known from all of the scan, by how probably each is one.
+    is known from all of the scan, by how probably each is one; and how rough its stones are.
     """
     n = len(compared)
     k = len(USUAL) + 1  # what markers share, with the noise
     found, shared, covs = np.empty((n, len(NAMES))), np.empty((n, k)), np.empty((n, k, k))
     shapes, by_gate = [np.empty((0, N_PARAMETERS))] * n, np.empty((n, len(GATES)))
-    physics = [_physics(one.features, noise, hearing, config) for one in compared]
+    physics = [_physics(one.features, noise, hearing, config, target.radius) for one in compared]
 
     def compare(rows: Sequence[int]) -> None:
         for i in rows:
@@ -262,27 +274,32 @@ def _log_likelihoods(
 
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)
     if n:
-        probabilities = [one.probability for one in _judged(compared, found, target.radius)]
+        shares = np.exp(_posteriors(compared, found, target.radius))
+        probabilities = shares[:, SPHERE].tolist()
         half_widths = np.array([one.evidence.blur.mean() for one in compared])
         known = shared_of((shared, covs), probabilities, physics, half_widths)
         gates = gates_of(by_gate, probabilities)
+        scatters = np.array([own[BOULDER, NOISE] for own in shapes])
+        usual = np.array([usual_stones(own[0], target.radius) for own in known[0]])
+        n_returns = [one.features.n_points for one in compared]
+        stones = stones_of(scatters, n_returns, shares[:, BOULDER], physics, usual)
         physics = [
-            one._replace(shared=means, sigmas=sigmas, gates=gates)
-            for one, means, sigmas in zip(physics, *known, strict=True)
+            one._replace(shared=means, sigmas=sigmas, gates=gates, stones=np.array(own))
+            for one, means, sigmas, *own in zip(physics, *known, *stones, strict=True)
         ]
     again = np.flatnonzero(found[:, 0] > found.max(axis=1, initial=-np.inf) - UNDECIDED)
     side_by_side(lambda first, end: compare(again[first:end].tolist()), len(again), threaded_from=4)
     return found, np.array([own[SPHERE, SHIFT:POLE] for own in shapes]).reshape(-1, 3)
 
 
-def _judged(compared: list[_Compared], logs: Array, radius: float) -> list[Judgement]:
-    """Return what groups are."""
+def _posteriors(compared: list[_Compared], logs: Array, radius: float) -> Array:
+    """Return the logarithms of the probabilities of all hypotheses, of each group, (n, k)."""
     n_returns = [one.features.n_points for one in compared]
-    return judged(logs, n_returns, [one.evidence.stands_free(radius) for one in compared])
+    return posteriors_of(logs, n_returns, [one.evidence.stands_free(radius) for one in compared])
 
 
 def _physics(
-    features: Features, noise: float, hearing: Hearing, config: ExtractionConfig
+    features: Features, noise: float, hearing: Hearing, config: ExtractionConfig, radius: float
 ) -> Physics:
     """Return what a scan shows of its physics, at a group."""
     least = 0.0 if features.n_points >= N_RESOLVED else NOISE_MIN
@@ -292,7 +309,8 @@ def _physics(
         _SIGMAS_LOG_NOISE[int(np.isnan(noise))],
     )
     means, sigmas = np.array([log_noise, *USUAL]), np.array([sigma, *SIGMAS])
-    return Physics(means, sigmas, *hearing)
+    stones = np.array([usual_stones(log_noise, radius), np.hypot(*STONES)])
+    return Physics(means, sigmas, *hearing, stones)
 
 
 def _candidates(found: list[_Group], target: Target) -> tuple[MarkerCandidate, ...]:

@@ -11,9 +11,8 @@ import numpy as np
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection.evidence import Evidence
 from spheremark.pipelines.detection.features import N_RESOLVED, NOISE_MIN, RESOLUTION, Features
-from spheremark.pipelines.detection.hypotheses import ABUNDANCE, ABUNDANCE_HELD, Physics
+from spheremark.pipelines.detection.hypotheses import ABUNDANCE, ABUNDANCE_HELD, STONES, Physics
 from spheremark.pipelines.detection.seeds import thinned
-from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.model import Array
 from spheremark.pipelines.scan.rigs import BEAM_WINDOW
@@ -37,6 +36,7 @@ _SCATTERED = 0.5  # share of other objects that lie anywhere, and not where mark
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
 _VARIES = (0.13, 0.15, 0.15, 0.1, 0.04, 0.02)  # of what markers share, between those of one scan
 _WINDOWS = (0.5, 1.0)  # of a VLP-16's width at its window, out or in: the first echo or the last
+_N_OF_STONE = 6.0  # parameters of a stone's ellipsoid that returns show
 _LEAST_INFORMATION = 1e-6  # of a group that shows nothing: next to none, but it can be inverted
 UNDECIDED = 12.0
 """Logarithm of odds against a marker up to which it is compared again with better optics."""
@@ -273,6 +273,43 @@ def shared_of(
     return found, np.sqrt(np.diagonal(known + varies, axis1=1, axis2=2))
 
 
+def stones_of(
+    scatters: Array,
+    n_returns: Sequence[int],
+    shares: Array,
+    physics: Sequence[Physics],
+    usual: Array,
+) -> tuple[Array, Array]:
+    """Return how rough the stones of a scan are, for each group as all others show it.
+
+    Parameters
+    ----------
+    scatters : (n,)
+        Logarithm of how far the surface of each lies about the best ellipsoid; NaN for none.
+    n_returns : sequence of int
+        Of each.
+    shares : (n,)
+        Probabilities that each is a stone: by as much it counts.
+    physics : sequence of Physics
+        With which these were computed.
+    usual : (n,)
+        What is expected of each before any is seen.
+
+    Returns
+    -------
+    (n,), (n,)
+        Means of the logarithms, and standard deviations that contain how far stones differ.
+    """
+    within, between = STONES
+    fitted = 0.5 / np.maximum(np.asarray(n_returns, np.float64) - _N_OF_STONE, 1.0)
+    begun, sigmas = np.array([one.stones for one in physics]).T
+    alone = np.nan_to_num(scatters + (scatters - begun) * fitted / sigmas**2)
+    weights = np.where(np.isfinite(scatters), shares, 0.0) / (within**2 + fitted)
+    pulls = weights * alone
+    total = between**-2 + weights.sum() - weights
+    return (usual / between**2 + pulls.sum() - pulls) / total, np.hypot(within, total**-0.5)
+
+
 def gates_of(by_gate: Array, probabilities: Sequence[float]) -> Array:
     """Return how probable each of ``GATES`` is in a scan, (9,).
 
@@ -306,10 +343,10 @@ def _by_windows(half_widths: Array) -> Array:
     return by
 
 
-def judged(
+def posteriors_of(
     log_likelihoods: Array, n_returns: Sequence[int], is_free: Sequence[bool]
-) -> list[Judgement]:
-    """Return what the groups of a scan are, given the likelihood of each by each hypothesis.
+) -> Array:
+    """Return the logarithms of the probabilities of all hypotheses, of each group, (n, k).
 
     How often a scan shows each hypothesis is estimated from all its groups (empirical Bayes): among
     trees, a group that might be leaves is rather leaves. Those that stand free, as on poles, say
@@ -323,7 +360,7 @@ def judged(
     free = np.asarray(is_free, np.bool_)
     for own, abundance in ((free, ABUNDANCE), (~free, ABUNDANCE_HELD)):
         posteriors[own] = shares_of(posteriors[own], abundance)[1]
-    return [judgement_of(own, NAMES) for own in posteriors]
+    return posteriors
 
 
 def judgement_of(posteriors: Array, names: Sequence[str]) -> Judgement:

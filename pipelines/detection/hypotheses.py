@@ -5,7 +5,7 @@ Hides their priors, and what the height of a place shows.
 
 from __future__ import annotations
 
-from math import erfc, exp, hypot
+from math import erfc, exp, hypot, log
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -52,7 +52,9 @@ _STAND = (SPHERE, BALL, CYLINDER, SOLID)  # on a pole or on something wide, or o
 # Means and standard deviations of the parameters
 _CENTRE, _POLE_SIZE = (0.3, 0.3, 0.4), (float(np.log(0.2)), 0.8)
 _HEAD_SIZE = (0.085, 1.3, 0.12)  # [m] half the width of a head, its height over it, their spread
-_RELIEF, _SIGMA_LOG_RELIEF = 0.08, 0.3  # of stones, hair and faces about an ellipsoid
+_RELIEF, _SIGMA_LOG_RELIEF = 0.08, 0.3  # radii: of stones, hair and faces about an ellipsoid
+STONES = (0.3, 0.6)
+"""Standard deviations of the logarithm of the relief of stones: in a scan, and between scans."""
 SOLIDS = (
     *((0.0, 0.3), (0.0, 0.14), (0.0, 0.1), (0.0, 0.1), (0.0, 0.1)),
     *((0.0, 0.2), (0.0, 0.2), (-0.35, 0.3), (0.0, 0.4), (0.0, 0.2)),
@@ -103,6 +105,9 @@ class Physics(NamedTuple):
         Share of the pulses on a surface without a return.
     weakest : float
         Reflectivity over squared range of the weakest returns [1/m^2].
+    stones : (2,)
+        Logarithm of how far surfaces of stones lie about an ellipsoid [radii], noise and all, and
+        its standard deviation.
     gates : (9,)
         Probabilities of each of ``GATES``.
     """
@@ -111,6 +116,7 @@ class Physics(NamedTuple):
     sigmas: Array
     lost: float
     weakest: float
+    stones: Array
     gates: Array = np.eye(1, len(GATES))[0]
 
 
@@ -201,10 +207,15 @@ def _priors(radius: float, physics: Physics) -> Array:
         priors[kind, :, FORM : FORM + len(form)] = np.transpose(form)
     priors[:, 0, POLE] = _POLE_SIZE[0]
     priors[[SPHERE, BALL, HEAD, CYLINDER, SOLID], 1, POLE] = _POLE_SIZE[1]
-    rough = hypot(noise, _RELIEF)
-    priors[[BOULDER, HEAD], :, NOISE] = np.log(rough), _SIGMA_LOG_RELIEF
+    priors[BOULDER, :, NOISE] = physics.stones
+    priors[HEAD, :, NOISE] = log(hypot(noise, _RELIEF)), _SIGMA_LOG_RELIEF
     priors[CLUTTER, 1, NOISE] = 0.0  # its own scatter is a parameter of form
     return priors
+
+
+def usual_stones(log_noise: float, radius: float) -> float:
+    """Return the logarithm of how far stones' surfaces lie about an ellipsoid [radii], usually."""
+    return log(hypot(exp(log_noise) / radius, _RELIEF))
 
 
 def _height_density(kind: int, height: float, sigma: float, radius: float) -> float:

@@ -171,7 +171,7 @@ def _start(kind: int, prior: Array, sphere: Array, start: float, beams: Beams) -
     """Return a start of the search for the best shape of a kind where the best sphere is."""
     shape: Array = prior[0].copy()
     shape[:STRETCH], shape[SHIFT:] = sphere[:STRETCH], sphere[SHIFT:]
-    if kind in (BOULDER, HEAD):
+    if kind == HEAD:
         shape[NOISE] = prior[0, NOISE]
     if kind in (SPHERE, BALL):
         shape[STRETCH] = sphere[STRETCH]

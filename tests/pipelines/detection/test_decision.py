@@ -6,17 +6,19 @@ from scipy import stats
 
 from spheremark.pipelines.detection.decision import (
     is_resolved,
-    judged,
+    judgement_of,
     noise_of,
     paint_of,
+    posteriors_of,
     reason_by_evidence,
     reason_by_features,
     shared_of,
+    stones_of,
     sure_ones,
 )
 from spheremark.pipelines.detection.evidence import N_ROWS, Evidence
 from spheremark.pipelines.detection.features import Features
-from spheremark.pipelines.detection.hypotheses import USUAL, Physics
+from spheremark.pipelines.detection.hypotheses import STONES, USUAL, Physics
 from spheremark.pipelines.detection.shapes import NAMES
 from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.scan.rigs import BEAM_WINDOW
@@ -95,6 +97,10 @@ def likelihoods(*sphere_over_others):
     return found
 
 
+def judged(found, n_returns, is_free):
+    return [judgement_of(own, NAMES) for own in posteriors_of(found, n_returns, is_free)]
+
+
 def test_probabilities_follow_the_likelihoods_and_name_the_best_other_hypothesis():
     found = likelihoods(12.0, 3.0, -4.0)
     found[2, NAMES.index("head on shoulders")] = 2.0
@@ -155,9 +161,10 @@ def test_a_few_returns_beside_spheres_do_not_hide_their_noise():
 N_SHARED = len(USUAL) + 1  # with the noise
 
 
-def physics(n, sigma):
+def physics(n, sigma, stones=(0.0, 1.0)):
     """Of groups of a scan: what nothing is known of but for a standard deviation, and 0.6."""
-    return [Physics(np.full(N_SHARED, 0.6), np.full(N_SHARED, sigma), 0.0, 0.0)] * n
+    shared = np.full(N_SHARED, 0.6), np.full(N_SHARED, sigma)
+    return [Physics(*shared, 0.0, 0.0, np.array(stones))] * n
 
 
 def shared(values, probabilities, sigma=100.0, half_widths=100.0):
@@ -277,3 +284,35 @@ def test_where_all_things_look_alike_paint_says_nothing(n_others):
     groups[8:] = [evidence(brightness=value) for value in np.geomspace(20.0, 125.0, n_others)]
     ratios, _ = paint_of(groups, [0.99] * 8 + [0.1] * n_others)
     assert np.all(ratios[:8] > 1.2)
+
+
+BEGUN = (-2.0, 0.5)  # what was expected of the scatter of stones when they were fitted
+
+
+def stones(logs, shares, n_returns=MANY):
+    """How rough the stones of a scan are; a tenth of a radius is usual."""
+    n = len(logs)
+    usual = np.full(n, np.log(0.1))
+    return stones_of(np.array(logs), [n_returns] * n, np.array(shares), physics(n, 1, BEGUN), usual)
+
+
+@pytest.mark.parametrize(("n", "n_returns"), [(1, MANY), (3, MANY), (12, MANY), (3, 8)])
+def test_a_stone_is_as_rough_as_the_others_of_a_scan_say_and_as_surely(n, n_returns):
+    within, between = STONES
+    rng = np.random.default_rng(5)
+    fitted = np.sqrt(0.5 / (n_returns - 6))  # of the logarithm of a scatter
+    share = BEGUN[1] ** 2 / (BEGUN[1] ** 2 + fitted**2)
+    off = []
+    for mean in rng.normal(np.log(0.1), between, 2000):
+        own = rng.normal(mean, within, n)
+        shown = own + np.append(rng.normal(0.0, fitted, n - 1), 9.0)  # nothing shows itself
+        means, sigmas = stones(BEGUN[0] + share * (shown - BEGUN[0]), [1.0] * n, n_returns)
+        off.append((own[-1] - means[-1]) / sigmas[-1])
+    assert np.mean(off) == pytest.approx(0.0, abs=0.08)
+    assert np.std(off) == pytest.approx(1.0, abs=0.06)
+
+
+def test_what_is_no_stone_says_nothing_of_stones():
+    means, sigmas = stones([np.nan, -9.0, -4.0, -1.0], [1.0, 0.0, 0.0, 0.0])
+    assert means == pytest.approx(np.log(0.1))
+    assert sigmas == pytest.approx(np.hypot(*STONES))
