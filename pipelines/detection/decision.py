@@ -285,7 +285,8 @@ def stones_of(
     Parameters
     ----------
     scatters : (n,)
-        Logarithm of how far the surface of each lies about the best ellipsoid; NaN for none.
+        Logarithm of how far the surface of each lies about the best ellipsoid [radii], noise and
+        all; NaN where no stone was sought.
     n_returns : sequence of int
         Of each.
     shares : (n,)
@@ -293,12 +294,17 @@ def stones_of(
     physics : sequence of Physics
         With which these were computed.
     usual : (n,)
-        What is expected of each before any is seen.
+        The same logarithm as it is expected of each before any stone is seen.
 
     Returns
     -------
     (n,), (n,)
         Means of the logarithms, and standard deviations that contain how far stones differ.
+
+    Notes
+    -----
+    The logarithm of the scatter of n returns about p parameters has a variance of 1/(2 (n - p)).
+    What each shows alone is its best scatter without the prior that it was fitted with.
     """
     within, between = STONES
     fitted = 0.5 / np.maximum(np.asarray(n_returns, np.float64) - _N_OF_STONE, 1.0)
