@@ -62,6 +62,7 @@ from spheremark.pipelines.detection.hypotheses import (
     USUAL,
     Physics,
     log_likelihoods,
+    shown_by,
     usual_stones,
 )
 from spheremark.pipelines.detection.pulses import Hearing
@@ -94,6 +95,7 @@ _MIDDLE = 0.87  # radii: incidence up to 60 degrees, as ASTM E3125-17 takes them
 _SHARP = 0.06  # radii: scatter of scanners whose returns at a limb err by more than their noise
 _POSSIBLE = 0.9  # probability from which a group that is no sure marker is a possible one
 _N_REJECTED, _N_NOT_COMPARED = 200, 100  # groups, the likeliest first, kept with their reason
+_COUNTS = 1e-3  # least probability of a marker that shows what markers have in common
 _SIGMAS_LOG_NOISE = (0.3, 0.6)  # of one marker about the others of a scan; of a scan about a group
 
 _N_ABOUT = 16  # returns about a refused group that show where it is by another mounting
@@ -260,36 +262,58 @@ def _log_likelihoods(
     is known from all of the scan, by how probably each is one; and how rough its stones are.
     """
     n = len(compared)
-    k = len(USUAL) + 1  # what markers share, with the noise
-    found, shared, covs = np.empty((n, len(NAMES))), np.empty((n, k)), np.empty((n, k, k))
-    shapes, by_gate = [np.empty((0, N_PARAMETERS))] * n, np.empty((n, len(GATES)))
+    found, shapes = np.empty((n, len(NAMES))), [np.empty((0, N_PARAMETERS))] * n
     physics = [_physics(one.features, noise, hearing, config, target.radius) for one in compared]
 
     def compare(rows: Sequence[int]) -> None:
         for i in rows:
             features, evidence = compared[i]
-            found[i], shared[i], covs[i], shapes[i], by_gate[i] = log_likelihoods(
+            found[i], shapes[i] = log_likelihoods(
                 evidence, features.p_base, target, physics[i], shapes[i]
             )
 
     side_by_side(lambda first, end: compare(range(first, end)), n, threaded_from=4)
     if n:
-        shares = np.exp(_posteriors(compared, found, target.radius))
-        probabilities = shares[:, SPHERE].tolist()
-        half_widths = np.array([one.evidence.blur.mean() for one in compared])
-        known = shared_of((shared, covs), probabilities, physics, half_widths)
-        gates = gates_of(by_gate, probabilities)
-        scatters = np.array([own[BOULDER, NOISE] for own in shapes])
-        usual = np.array([usual_stones(own[0], target.radius) for own in known[0]])
-        n_returns = [one.features.n_points for one in compared]
-        stones = stones_of(scatters, n_returns, shares[:, BOULDER], physics, usual)
-        physics = [
-            one._replace(shared=means, sigmas=sigmas, gates=gates, stones=np.array(own))
-            for one, means, sigmas, *own in zip(physics, *known, *stones, strict=True)
-        ]
+        physics = _as_others_show(compared, found, np.array(shapes), physics, target)
     again = np.flatnonzero(found[:, 0] > found.max(axis=1, initial=-np.inf) - UNDECIDED)
     side_by_side(lambda first, end: compare(again[first:end].tolist()), len(again), threaded_from=4)
     return found, np.array([own[SPHERE, SHIFT:POLE] for own in shapes]).reshape(-1, 3)
+
+
+def _as_others_show(
+    compared: list[_Compared],
+    found: Array,
+    shapes: Array,
+    physics: list[Physics],
+    target: Target,
+) -> list[Physics]:
+    """Return the physics of each group as all others show it, by the best shapes of all kinds."""
+    shares = np.exp(_posteriors(compared, found, target.radius))
+    shared = np.array([one.shared for one in physics])
+    covs = np.array([np.diag(one.sigmas**2) for one in physics])  # it shows nothing
+    by_gate = np.zeros((len(compared), len(GATES)))
+    rows = np.flatnonzero(shares[:, SPHERE] > _COUNTS)
+
+    def show(first: int, end: int) -> None:
+        for i in rows[first:end]:
+            (features, evidence), sphere = compared[i], shapes[i, SPHERE]
+            shared[i], covs[i], by_gate[i] = shown_by(
+                evidence, features.p_base, target, physics[i], sphere
+            )
+
+    side_by_side(show, len(rows), threaded_from=4)
+    probabilities = shares[:, SPHERE].tolist()
+    half_widths = np.array([one.evidence.blur.mean() for one in compared])
+    known = shared_of((shared, covs), probabilities, physics, half_widths)
+    gates = gates_of(by_gate, probabilities)
+    usual = np.array([usual_stones(own[0], target.radius) for own in known[0]])
+    n_returns = [one.features.n_points for one in compared]
+    scatters = shapes[:, BOULDER, NOISE]
+    stones = stones_of(scatters, n_returns, shares[:, BOULDER], physics, usual)
+    return [
+        one._replace(shared=means, sigmas=sigmas, gates=gates, stones=np.array(own))
+        for one, means, sigmas, *own in zip(physics, *known, *stones, strict=True)
+    ]
 
 
 def _posteriors(compared: list[_Compared], logs: Array, radius: float) -> Array:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.detection.beams import GATES, beams_about, merged_within
+from spheremark.pipelines.detection.beams import GATES, Beams, beams_about, merged_within
 from spheremark.pipelines.detection.evidence import Evidence
 from spheremark.pipelines.detection.faces import MOVED, TURNED
 from spheremark.pipelines.detection.search import compared, shared_by
@@ -134,8 +134,8 @@ def log_likelihoods(
     target: Target,
     physics: Physics,
     begun: Array,
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the logarithms of the likelihoods of all hypotheses, and what the best sphere shows.
+) -> tuple[Array, Array]:
+    """Return the logarithms of the likelihoods of all hypotheses, and the best shape by each.
 
     Parameters
     ----------
@@ -152,9 +152,8 @@ def log_likelihoods(
 
     Returns
     -------
-    (k,), (6,), (6, 6), (k, p), (9,)
-        Logarithms; what markers share, as in ``Physics``, and its covariance; the best shapes;
-        the logarithms of the likelihoods of the best sphere by each of ``GATES``.
+    (k,), (k, p)
+        Logarithms, and shapes.
 
     Notes
     -----
@@ -162,34 +161,67 @@ def log_likelihoods(
     approximation, or a sequential Monte Carlo where the decision is close. Beams are independent
     but for those of one place.
     """
+    height, sigma, radius = evidence.height, evidence.sigma_height, target.radius
+    held, perched = _shares_held(evidence, radius)
+    logs = log_supports(evidence, float(centre @ target.up), radius, held, perched)
+    for kind in range(len(NAMES)):
+        logs[kind] += np.log(_height_density(kind, height, sigma, radius))
+    beams, priors = _compared_at(evidence, centre, target, physics, _N_BEAMS[len(begun) > 0])
+    found, shapes = compared(beams, priors, logs, begun)
+    return np.asarray(np.maximum(found, found.max() - _NEVER)), shapes
+
+
+def shown_by(
+    evidence: Evidence, centre: Array, target: Target, physics: Physics, sphere: Array
+) -> tuple[Array, Array, Array]:
+    """Return what the best sphere at a place shows of the physics of its scan.
+
+    Parameters
+    ----------
+    evidence, centre, target, physics
+        As in ``log_likelihoods``.
+    sphere : (p,)
+        The best one, by the same physics.
+
+    Returns
+    -------
+    (6,), (6, 6), (9,)
+        What markers share, as in ``Physics``, and its covariance; the logarithms of the likelihoods
+        of the sphere by each of ``GATES``.
+    """
+    beams, priors = _compared_at(evidence, centre, target, physics, _N_BEAMS[0])
+    shared, cov = shared_by(sphere, priors[SPHERE], physics.sigmas[ALONG - NOISE], beams)
+    shared[0] += np.log(target.radius)
+    by_gate, densities = np.empty(len(GATES)), np.empty(len(beams.x))
+    for i, gate in enumerate(np.eye(len(GATES))):
+        own = merged_within(beams, gate, target.radius)
+        by_gate[i] = log_likelihood(SPHERE, sphere, priors[SPHERE], own, densities)
+    return shared, cov, by_gate
+
+
+def _compared_at(
+    evidence: Evidence, centre: Array, target: Target, physics: Physics, n_most: int
+) -> tuple[Beams, Array]:
+    """Return the beams that are compared at a place, and the priors of all shapes there."""
     distance, radius = float(np.linalg.norm(centre)), target.radius
     strength = max(evidence.brightness, 1.0) / distance**2
     faintest = min(max(physics.weakest / strength, _FLOOR), _HEARD)  # its own returns are heard
-    hearing, n_most = (physics.lost, faintest), _N_BEAMS[int(len(begun) > 0)]
-    beams = beams_about(evidence, radius, strength, hearing, n_most)
-    beams = merged_within(beams, physics.gates, radius)
-    standing = _standing_densities(evidence.height, evidence.sigma_height, radius)
-    lying = _boulder_densities(evidence.height, evidence.sigma_height, radius)
-    held, perched = (own[1] / sum(own) for own in (standing, lying))
-    logs = log_supports(evidence, float(centre @ target.up), radius, held, perched)
-    for kind in range(len(NAMES)):
-        logs[kind] += np.log(_height_density(kind, evidence.height, evidence.sigma_height, radius))
-    priors = _priors(radius, physics)
+    beams = beams_about(evidence, radius, strength, (physics.lost, faintest), n_most)
+    beams, priors = merged_within(beams, physics.gates, radius), _priors(radius, physics)
+    held, perched = _shares_held(evidence, radius)
     priors[_STAND, 0, STONE], priors[BOULDER, 0, STONE] = np.round((_ON_STONE * held, perched), 2)
-    if abs(beams.face.sum()) < 0.5 * len(beams.face) - 3:
+    if abs(beams.face.sum()) < 0.5 * len(beams.face) - 3:  # both faces of the scan show it
         moved = MOVED / radius
         priors[SPHERE, 1, SHIFT:POLE] = moved
         priors[SPHERE, 1, SHIFT : SHIFT + 2] = hypot(TURNED * distance / radius, moved)
-    found, shapes = compared(beams, priors, logs, begun)
-    sphere = shapes[SPHERE]
-    never = float(found.max()) - _NEVER
-    shared, cov = shared_by(sphere, priors[SPHERE], physics.sigmas[ALONG - NOISE], beams)
-    shared[0] += np.log(radius)
-    by_gate, densities = np.empty(len(GATES)), np.empty(len(beams.x))
-    for i, gate in enumerate(np.eye(len(GATES))):
-        own = merged_within(beams, gate, radius)
-        by_gate[i] = log_likelihood(SPHERE, sphere, priors[SPHERE], own, densities)
-    return np.asarray(np.maximum(found, never)), shared, cov, shapes, by_gate
+    return beams, priors
+
+
+def _shares_held(evidence: Evidence, radius: float) -> tuple[float, float]:
+    """Return how probably what is so high stands on something wide, and a boulder on another."""
+    standing = _standing_densities(evidence.height, evidence.sigma_height, radius)
+    lying = _boulder_densities(evidence.height, evidence.sigma_height, radius)
+    return standing[1] / sum(standing), lying[1] / sum(lying)
 
 
 def _priors(radius: float, physics: Physics) -> Array:

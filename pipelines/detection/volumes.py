@@ -41,7 +41,7 @@ def log_volume(kind: int, shape: Array, prior: Array, beams: Beams) -> float:
     By Laplace's approximation.
     """
     free, N = information(kind, shape, prior, beams)
-    total, root = _log_another(kind, shape, prior, beams, (free, N)), np.zeros_like(N)
+    total, root = 0.0, np.zeros_like(N)
     for j in range(SHIFT, POLE):
         if prior[1, j] > 0.0:  # a property of the scan
             total += 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
@@ -62,7 +62,7 @@ def log_integral(kind: int, shape: Array, prior: Array, beams: Beams) -> float:
     prior = prior.copy()
     prior[1, SHIFT:POLE] = 0.0  # a property of the scan
     free, N = information(kind, shape, prior, beams)
-    total, root = _log_another(kind, shape, prior, beams, (free, N)), np.zeros_like(N)
+    total, root = 0.0, np.zeros_like(N)
     invert(N, N)
     factorise(N, root)
     for j in range(len(free)):
@@ -140,19 +140,15 @@ def _drawn_anew(drawn: Array, found: Array, weights: Array) -> float:
 
 
 @compiled
-def _log_another(
-    kind: int, shape: Array, prior: Array, beams: Beams, known: tuple[Index, Array]
-) -> float:
-    """Return the logarithm of the probability that a ball or a boulder is not as a marker is.
-
-    ``known`` are its free parameters and their information.
-    """
+def log_another(kind: int, shape: Array, prior: Array, beams: Beams) -> float:
+    """Return the logarithm of the probability that a ball or a boulder is not as a marker is."""
     if kind == BALL:
         return float(_log_other_size(shape, prior, beams))
     if kind != BOULDER:
         return 0.0
-    free, same, cov = known[0], 1.0, np.empty_like(known[1])
-    invert(known[1], cov)
+    free, cov = information(kind, shape, prior, beams)
+    invert(cov, cov)
+    same = 1.0
     for j in range(len(free)):
         if FORM <= free[j] < SHIFT:
             off = shape[free[j]]
