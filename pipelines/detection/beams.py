@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spheremark.pipelines.detection.evidence import Evidence
+from spheremark.pipelines.detection.evidence import N_ROWS, ROW, Evidence
 from spheremark.pipelines.model import Array, Index, Mask
 
 NEAR = 3.0
@@ -82,7 +82,12 @@ class Beams(NamedTuple):
 
 
 def beams_about(
-    evidence: Evidence, radius: float, strength: float, hearing: tuple[float, float], n_most: int
+    evidence: Evidence,
+    radius: float,
+    strength: float,
+    hearing: tuple[float, float],
+    held: Array,
+    n_most: int,
 ) -> Beams:
     """Return the beams that are compared.
 
@@ -96,6 +101,8 @@ def beams_about(
         Reflectivity over squared range of the object [1/m^2].
     hearing : float, float
         ``lost`` and ``faintest`` of ``Beams``.
+    held : (9,)
+        Probabilities that something wide holds it that has begun at each row of ``ROW``.
     n_most : int
         Most beams that are compared: each costs as much.
     """
@@ -113,7 +120,9 @@ def beams_about(
     is_low = (np.abs(x) > _BESIDE[0] + blurs[0]) & (np.abs(x) < _BESIDE[1] + blurs[0])
     is_low &= (y > _UNDER[1]) & (y < BELOW)
     behind = share * _density_near(every[:3, kept], every[:3, is_high & is_near])
-    behind, wide = _behind(every[:3, kept], every[:3, is_low], (behind, 1.0 - share))
+    rows = np.clip((-y[kept] / ROW).astype(np.intp), 0, N_ROWS - 1)
+    on_wide = held[rows] * (gap[kept] > _BESIDE[0] + blur)
+    behind, wide = _behind(every[:3, kept], every[:3, is_low], on_wide, (behind, 1.0 - share))
     empty, even, away = _beside(every[:, kept], every[:, is_beside], strength)
     return Beams(
         x=x[kept],
@@ -172,22 +181,28 @@ def _density_near(kept: Array, near: Array) -> Array:
     return density
 
 
-def _behind(kept: Array, low: Array, beside: tuple[Array, float]) -> tuple[Array, Array]:
+def _behind(
+    kept: Array, low: Array, on_wide: Array, beside: tuple[Array, float]
+) -> tuple[Array, Array]:
     """Return ``behind`` and ``wide``.
 
     Low down, beams end as those do that pass farther to the sides at the same height: what a sphere
-    stands on may be wider than a pole. ``beside`` is the density of those that end near, and the
-    share of the others, higher up.
+    stands on may be wider than a pole. If it is, beams end as the others do that pass below.
+    ``on_wide`` is how probably each of these is one; ``beside`` the density of those that end near,
+    and the share of the others, higher up.
     """
     density = np.where(kept[2] < NEAR, *beside)
-    is_under, is_near = kept[1] < _LOWEST, low[2] < NEAR
+    is_under = kept[1] < _LOWEST
     y, z = kept[1:3, is_under]
-    weights = np.exp(-0.5 * ((y[:, None] - low[1]) / _ALIKE) ** 2)
+    others = np.hstack([low, kept])
+    weights = np.exp(-0.5 * ((y[:, None] - others[1]) / _ALIKE) ** 2)
+    weights[:, low.shape[1] :] *= on_wide * ~np.eye(len(on_wide), dtype=np.bool_)[is_under]
+    is_near = others[2] < NEAR
     total, wide = weights.sum(axis=1) + 1.0, np.zeros(kept.shape[1])
-    near = _density_between(kept[:3, is_under], low[:, is_near], weights[:, is_near])
+    near = _density_between(kept[:3, is_under], others[:, is_near], weights[:, is_near])
     alike = np.where(z < NEAR, near, weights @ ~is_near)
     density[is_under] = (density[is_under] + alike) / total
-    wide[is_under] = weights @ (low[2] < 0.0) / total
+    wide[is_under] = weights @ (others[2] < 0.0) / total
     return density, wide
 
 

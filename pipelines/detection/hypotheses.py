@@ -33,7 +33,6 @@ from spheremark.pipelines.detection.shapes import (
     SHIFT,
     SOLID,
     SPHERE,
-    STONE,
     STRETCH,
     Z,
     log_likelihood,
@@ -82,7 +81,6 @@ ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
 
 _HEIGHTS, _TALLER = 2.5, 1.0  # [m] up to which markers stand; and how much higher, if they do
 _ON_WIDE, _WIDE = 0.1, 0.4  # probability of standing on something wide, and how high that is [m]
-_ON_STONE = 0.25  # of what stands on something wide or on the ground, on a stone
 _LYING, _UNEVEN = 0.1, 0.2  # probability of lying on the ground; radii that it sinks in, or less
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
@@ -162,8 +160,7 @@ def log_likelihoods(
     but for those of one place.
     """
     height, sigma, radius = evidence.height, evidence.sigma_height, target.radius
-    held, perched = _shares_held(evidence, radius)
-    logs = log_supports(evidence, float(centre @ target.up), radius, held, perched)
+    logs, _ = _log_supports(evidence, centre, target)
     for kind in range(len(NAMES)):
         logs[kind] += np.log(_height_density(kind, height, sigma, radius))
     beams, priors = _compared_at(evidence, centre, target, physics, _N_BEAMS[len(begun) > 0])
@@ -206,10 +203,9 @@ def _compared_at(
     distance, radius = float(np.linalg.norm(centre)), target.radius
     strength = max(evidence.brightness, 1.0) / distance**2
     faintest = min(max(physics.weakest / strength, _FLOOR), _HEARD)  # its own returns are heard
-    beams = beams_about(evidence, radius, strength, (physics.lost, faintest), n_most)
+    _, held = _log_supports(evidence, centre, target)
+    beams = beams_about(evidence, radius, strength, (physics.lost, faintest), held, n_most)
     beams, priors = merged_within(beams, physics.gates, radius), _priors(radius, physics)
-    held, perched = _shares_held(evidence, radius)
-    priors[_STAND, 0, STONE], priors[BOULDER, 0, STONE] = np.round((_ON_STONE * held, perched), 2)
     if abs(beams.face.sum()) < 0.5 * len(beams.face) - 3:  # both faces of the scan show it
         moved = MOVED / radius
         priors[SPHERE, 1, SHIFT:POLE] = moved
@@ -217,11 +213,13 @@ def _compared_at(
     return beams, priors
 
 
-def _shares_held(evidence: Evidence, radius: float) -> tuple[float, float]:
-    """Return how probably what is so high stands on something wide, and a boulder on another."""
-    standing = _standing_densities(evidence.height, evidence.sigma_height, radius)
-    lying = _boulder_densities(evidence.height, evidence.sigma_height, radius)
-    return standing[1] / sum(standing), lying[1] / sum(lying)
+def _log_supports(evidence: Evidence, centre: Array, target: Target) -> tuple[Array, Array]:
+    """Return what ``log_supports`` does, by the height of a place."""
+    height, sigma, radius = evidence.height, evidence.sigma_height, target.radius
+    standing = _standing_densities(height, sigma, radius)
+    lying = _boulder_densities(height, sigma, radius)
+    held, perched = standing[1] / sum(standing), lying[1] / sum(lying)
+    return log_supports(evidence, float(centre @ target.up), radius, held, perched)
 
 
 def _priors(radius: float, physics: Physics) -> Array:

@@ -31,18 +31,15 @@ SPHERE, BALL, BOULDER, HEAD, CYLINDER, POST, SOLID, PANEL, CLUTTER = range(len(N
 # noise; half widths of a beam outside an outline where half the beams hit, before an empty sky and
 # before what sends an echo of its own; logarithm of how much wider a beam is along the spin axis
 # than its data sheet says; that of a stretch of depths; up to ten of form; the place of one face of
-# the scan against the other; logarithm of the width of the pole over that of what it holds;
-# probability that a stone holds it, known beforehand
-X, Y, Z, NOISE, EDGE, ALONG, STRETCH, FORM, SHIFT, POLE, STONE, N_PARAMETERS = (
-    *(0, 1, 2, 3, 4, 6, 7, 8, 18, 21, 22, 23),
+# the scan against the other; logarithm of the width of the pole over that of what it holds
+X, Y, Z, NOISE, EDGE, ALONG, STRETCH, FORM, SHIFT, POLE, N_PARAMETERS = (
+    *(0, 1, 2, 3, 4, 6, 7, 8, 18, 21, 22),
 )
 
 MEAN = 2.0 / 3.0  # of a radius: mean height of a sphere's surface over its disc
 _POLE_FROM, _POLE_DEPTH, _POLE_SHARE = 0.8, 0.4, 0.7  # of a pole, and of its beams that it stops
 _POLE_MOST = 0.9  # of the radius of what it holds: half the width of a pole
 _POST, _POST_DEPTH = 0.5, 0.1  # radii: least half width of a post, and scatter of its surface
-_STONE_SIZE, _VARIES = 2.0, 0.125  # radii of a stone below; by what share half its width may be off
-_DIP = 0.25  # of the height at which poles begin: what is not round lies so much deeper on a stone
 _UPRIGHT = 0.3  # of posts are round and upright; what else is as wide is anything
 _STRAY = 0.02  # share of the returns from a surface that lie anywhere: crosstalk, dust, strays
 _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between it and what is behind
@@ -187,24 +184,6 @@ def _stopped(rest: float, on: tuple[float, float], z: float, wide: float, h: _He
 
 
 @compiled
-def _on_stone(x: float, z: float, downs: tuple[float, float], blur: float) -> tuple[float, float]:
-    """Return the share of a beam on a stone, and the density of a depth there.
-
-    It is round on top, and the object lies about its middle. ``downs`` are how far below its top
-    the beam passes, if the object dips into it or touches it: each is as likely.
-    """
-    share, density = 0.0, 0.0
-    for down in downs:
-        if down > 0.0:
-            half = np.sqrt(2.0 * _STONE_SIZE * down)
-            sigma = np.sqrt(_POLE_DEPTH**2 + (_VARIES * half) ** 2)
-            own = 0.5 * _inside(half - abs(x), blur, 0.0)
-            share += own
-            density += own * _normal(z - _round(abs(x), half, blur), sigma)
-    return share, density / (share + _FLOOR)
-
-
-@compiled
 def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float, float]:
     """Return the share of a beam that a deformed sphere stops, depth, and how evenly it is split.
 
@@ -268,13 +247,8 @@ def trust(beams: Beams) -> float:
 
 @compiled
 def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densities: Array) -> float:
-    """Return the logarithm of likelihood times prior density of a shape; write those of beams.
-
-    What holds it up is a pole or nothing, or a stone: all beams below show which.
-    """
-    total, product, stone = 0.0, 1.0, prior[0, STONE]
-    gain, ratio, others = 0.0, 1.0, np.zeros(len(beams.x) if stone > 0.0 else 0)
-    form = _form_of(kind, shape)
+    """Return the logarithm of likelihood times prior density of a shape; write those of beams."""
+    total, product, form = 0.0, 1.0, _form_of(kind, shape)
     pole = form[0] * min(np.exp(shape[POLE]), _POLE_MOST) if prior[1, POLE] > 0.0 else 0.0
     variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
     sigma = np.sqrt(variance)
@@ -284,32 +258,23 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
         x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
         y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
         moved = shape[Z] + beams.face[i] * shape[SHIFT + 2]
-        z, down = beams.z[i] - moved, bottom - y
+        z = beams.z[i] - moved
         rest, beam = beams.behind[i], _beam(shape, blurs, beams, i)
-        if pole > 0.0 and down > 0.0:
+        if pole > 0.0 and y < bottom:
             held = _on_pole(x, z - MEAN, pole, beam, sigma)
             rest = _stopped(rest, held, beams.z[i], beams.wide[i], hearing)
         share, depth, divided = _surface(kind, x, y, shape, form, beam)
         on = 0.0
         if share > 0.0:
             on = _on_surface(kind, share, z - depth, sigma, beams.z[i], hearing)
-        merged, surface = divided * beams.merged[i], (moved + depth, sigma)
         density = share * on + (1.0 - share) * rest
-        densities[i] = _merged(density, merged, beams, i, surface) + _FLOOR
-        if stone > 0.0 and down > 0.0:
-            held = _on_stone(x, z - MEAN, (down, down + _DIP * bottom), blurs[0])
-            rest = _stopped(beams.behind[i], held, beams.z[i], beams.wide[i], hearing)
-            density = share * on + (1.0 - share) * rest
-            others[i] = _merged(density, merged, beams, i, surface) + _FLOOR
-            ratio *= others[i] / densities[i]
-            if not 1e-200 < ratio < 1e200:
-                gain, ratio = gain + np.log(ratio), 1.0
-        product *= densities[i]
+        surface = (moved + depth, sigma)
+        density = _merged(density, divided * beams.merged[i], beams, i, surface) + _FLOOR
+        densities[i] = density
+        product *= density
         if not 1e-200 < product < 1e200:
             total, product = total + np.log(product), 1.0
-    own = trust(beams)
-    total = _log_prior(shape, prior) + own * (total + np.log(product))
-    return float(total + _log_held(stone, own * (gain + np.log(ratio)), others, densities))
+    return float(_log_prior(shape, prior) + trust(beams) * (total + np.log(product)))
 
 
 @compiled
@@ -320,25 +285,6 @@ def _log_prior(shape: Array, prior: Array) -> float:
         if prior[1, j] > 0.0:
             total -= 0.5 * ((shape[j] - prior[0, j]) / prior[1, j]) ** 2
     return total
-
-
-@compiled
-def _log_held(stone: float, gain: float, others: Array, densities: Array) -> float:
-    """Return the logarithm of how much likelier beams are if a stone may hold an object up.
-
-    ``gain`` is that if one does, ``others`` the densities of the beams then, 0 for those above.
-    The densities become the means of both by how probable the stone is, in the logarithm.
-    """
-    if stone <= 0.0:
-        return 0.0
-    held = np.log(stone) + gain
-    either = np.logaddexp(np.log(1.0 - stone + _FLOOR), held)
-    share = np.exp(held - either)
-    if share > _FLOOR:
-        for i in range(len(others)):
-            if others[i] > 0.0:
-                densities[i] *= (others[i] / densities[i]) ** share
-    return float(either)
 
 
 @compiled

@@ -6,7 +6,7 @@ stop all from some height downwards.
 
 from __future__ import annotations
 
-from math import lgamma, log
+from math import exp, lgamma, log
 
 import numpy as np
 
@@ -23,20 +23,26 @@ _OPEN, _CLOSED, _ANY = (0.3, 5.0), (5.0, 0.3), (0.5, 0.5)
 
 _NEIGHBOUR = 0.05  # probability that something else is on one side; a boulder has ground on both
 _DOUBT = 0.1  # probability of anything below what stands on a pole or on something wide
+_RAREST = 1e-9  # nothing is less probable before a beam is seen
 _ROWS = np.array([0.0, *(0.2,) * 3, *(0.08,) * 5])
 """Probabilities of the row from which something wide stops the beams below what stands on it: it
 begins there, or widens farther down, as a cone does or a tripod."""
 
 # Probabilities that nothing is below, that anything is, and that something is from each row down:
 # shoulders begin within three radii below a head
-_GROUND = (0.005, 0.005, *(0.2475,) * 4, *(0.0,) * 5)
-_SHOULDERS = (0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0)
+_ON_POLE = np.array([1.0 - _DOUBT, _DOUBT, *(0.0,) * 9])
+_ON_WIDE = np.array([0.001, _DOUBT, *((0.999 - _DOUBT) * _ROWS)])
+_ON_GROUND = np.array([0.005, 0.005, *(0.2475,) * 4, *(0.0,) * 5])
+_ON_ANOTHER = np.array([0.005, 0.005, 0.0, *(0.33,) * 3, *(0.0,) * 5])  # it is round on top
+_SHOULDERS = np.array([0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0])
 
 
 def log_supports(
     evidence: Evidence, level: float, radius: float, held: float, perched: float
-) -> Array:
+) -> tuple[Array, Array]:
     """Return the log probabilities of the beams below a place by all hypotheses, (k,).
+
+    And how probably something wide holds it that has begun at each row, as those beams show, (9,).
 
     Parameters
     ----------
@@ -57,28 +63,31 @@ def log_supports(
     stops them is marginalised. Both sides show what holds it up, or one does and the other shows a
     neighbour; the ground is on both. What is neither a boulder nor a head is held as a sphere is.
     """
-    return _log_supports(*_beams_below(evidence, level, radius), supports_of(held, perched))
+    return _log_supports(*_beams_below(evidence, level, radius), held, perched)
 
 
-def supports_of(held: float, perched: float) -> Array:
-    """Return the probabilities of what is below a sphere, a boulder and a head, (3, 2 + 9).
+def _log_supports(near: Array, past: Array, held: float, perched: float) -> tuple[Array, Array]:
+    """Return the same, from beams to the left and to the right by rows, (2, 9)."""
+    pole, wide, shoulders = (
+        _log_supported(near, past, own, _NEIGHBOUR) for own in (_ON_POLE, _ON_WIDE, _SHOULDERS)
+    )
+    ground, another = (_log_supported(near, past, own, 0.0) for own in (_ON_GROUND, _ON_ANOTHER))
+    stands, held = _either(pole, wide, held)
+    boulder, _ = _either(ground, another, perched)
+    logs = np.full(len(NAMES), stands)
+    logs[BOULDER], logs[HEAD] = boulder, shoulders
+    return logs, held * _shares_begun(near.sum(axis=0), past.sum(axis=0))
 
-    Of nothing, of anything, and of something from each row down. Arguments as in ``log_supports``.
+
+def _either(first: float, second: float, share: float) -> tuple[float, float]:
+    """Return the log probability by either of two causes, and how probably it is the second.
+
+    From the log probabilities by each, and the share of the second before.
     """
-    on_wide = np.array([0.0, _DOUBT, *((1.0 - _DOUBT) * _ROWS)])
-    stands = held * on_wide
-    stands[:2] = (1.0 - _DOUBT) * (1.0 - held), _DOUBT
-    boulder = perched * on_wide + (1.0 - perched) * np.array(_GROUND)
-    return np.array([stands, boulder, _SHOULDERS])
-
-
-def _log_supports(near: Array, past: Array, supports: Array) -> Array:
-    """Return the log probabilities of beams, left and right by rows (2, 9), by hypotheses (k,)."""
-    stands, boulder, head = supports
-    logs = np.full(len(NAMES), _log_supported(near, past, stands, _NEIGHBOUR))
-    logs[BOULDER] = _log_supported(near, past, boulder, 0.0)
-    logs[HEAD] = _log_supported(near, past, head, _NEIGHBOUR)
-    return logs
+    share = min(max(share, _RAREST), 1.0 - _RAREST)
+    first, second = first + log(1.0 - share), second + log(share)
+    total = float(np.logaddexp(first, second))
+    return total, exp(second - total)
 
 
 def _beams_below(evidence: Evidence, level: float, radius: float) -> tuple[Array, Array]:
@@ -144,6 +153,22 @@ def _log_support(near: Array, past: Array, support: Array) -> float:
             found = np.logaddexp(found, begun + _log_share(n_near - over, n_past - passed, _CLOSED))
         over, passed = over + near[row], passed + past[row]
     return float(found)
+
+
+@compiled
+def _shares_begun(near: Array, past: Array) -> Array:
+    """Return how probably something wide, if it holds a place, has begun at each row, (9,)."""
+    n_near, n_past, over, passed = near.sum(), past.sum(), 0.0, 0.0
+    anything = log(_DOUBT) + _log_share(n_near, n_past, _ANY)
+    logs = np.full(len(near), -np.inf)
+    for row in range(len(near)):
+        if _ROWS[row] > 0.0:
+            begun = log((1.0 - _DOUBT) * _ROWS[row]) + _log_share(over, passed, _OPEN)
+            logs[row] = begun + _log_share(n_near - over, n_past - passed, _CLOSED)
+        over, passed = over + near[row], passed + past[row]
+    most = max(logs.max(), anything)
+    shares = np.exp(logs - most)
+    return np.asarray(np.cumsum(shares) / (shares.sum() + np.exp(anything - most)))
 
 
 @compiled

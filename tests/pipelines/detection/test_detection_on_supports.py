@@ -9,7 +9,7 @@ from spheremark.pipelines.detection.beams import _behind
 from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
 
 GROUND, N = -0.8, 6
-DRUM_RADIUS, DRUM_HEIGHT = 0.25, 0.5
+DRUM_RADIUS = 0.25
 
 
 def ring(distance, height, turn):
@@ -32,10 +32,10 @@ def found_in(places, posts=()):
     return is_met[:, 5:].any(axis=0), int(np.sum(~is_met.any(axis=1)))
 
 
-@pytest.mark.parametrize("distance", [3.5, 6.0])
-def test_markers_on_drums_are_found(distance):
-    places = ring(distance, DRUM_HEIGHT + RADIUS, 0.5)
-    drums = tuple(((x, y, GROUND), DRUM_RADIUS, DRUM_HEIGHT) for x, y, _ in places)
+@pytest.mark.parametrize(("distance", "height"), [(3.5, 0.5), (6.0, 0.5), (6.0, 0.8)])
+def test_markers_on_drums_are_found(distance, height):
+    places = ring(distance, height + RADIUS, 0.5)
+    drums = tuple(((x, y, GROUND), DRUM_RADIUS, height) for x, y, _ in places)
     is_found, n_others = found_in(places, drums)
     assert is_found.all()
     assert n_others == 0
@@ -69,7 +69,8 @@ def densities_below(z_beside, z_below):
     """Density of a beam below an object, where those beside it at the same height end."""
     sides = np.linspace(-2.2, 2.2, 40)
     low = np.stack([sides, np.full(40, -1.5), np.full(40, z_beside)])
-    return _behind(np.array([[0.0], [-1.5], [z_below]]), low, (np.array([0.003]), 0.98))
+    below = np.array([[0.0], [-1.5], [z_below]])
+    return _behind(below, low, np.zeros(1), (np.array([0.003]), 0.98))
 
 
 def test_beams_below_an_object_end_as_those_beside_them_do():
@@ -91,6 +92,21 @@ def test_the_side_of_a_box_goes_on_below_an_object():
     low = np.stack([sides, np.full(8, -1.5), 0.8 * sides])
     depths = np.array([0.0, 0.7])
     below = np.stack([np.zeros(2), np.full(2, -1.5), depths])
-    on_side, off_side = _behind(below, low, (np.full(2, 0.003), 0.98))[0]
+    on_side, off_side = _behind(below, low, np.zeros(2), (np.full(2, 0.003), 0.98))[0]
     assert on_side > 5.0 * off_side
     assert off_side > 0.02  # it may turn a corner there
+
+
+def test_beams_below_end_as_the_others_below_do_if_something_wide_is_there():
+    """A stone bulges: none of the beams beside an object is as deep as those on it below."""
+    sides = np.array([-2.2, -1.8, 1.8, 2.2])
+    low = np.stack([sides, np.full(4, -1.5), np.full(4, 0.5)])
+    below = np.stack([np.linspace(-0.4, 0.4, 9), np.full(9, -1.5), np.full(9, -1.0)])
+    on_pole, doubtful, on_stone = (
+        _behind(below, low, np.full(9, held), (np.full(9, 0.003), 0.98))[0]
+        for held in (0.0, 0.5, 1.0)
+    )
+    assert (on_stone > 5.0 * on_pole).all()
+    assert ((on_pole < doubtful) & (doubtful < on_stone)).all()
+    alone = _behind(below[:, :1], low, np.ones(1), (np.full(1, 0.003), 0.98))[0]
+    np.testing.assert_allclose(alone, on_pole[0])  # a beam says nothing about itself

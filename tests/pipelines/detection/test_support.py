@@ -12,12 +12,11 @@ from spheremark.pipelines.detection.support import (
     _beams_below,
     _log_share,
     _log_supports,
-    supports_of,
 )
 
 N = 10  # beams in each row on each side
-ON_POLES, ON_WIDE = supports_of(0.05, 1.0), supports_of(0.6, 1.0)  # as high as poles, and crates
-LOW = supports_of(0.6, 0.0)  # and as what lies on the ground
+ON_POLES, ON_WIDE = (0.05, 1.0), (0.6, 1.0)  # shares held, and perched: as high as poles, crates
+LOW = (0.6, 0.0)  # and as what lies on the ground
 
 
 def logs(*near):
@@ -25,9 +24,9 @@ def logs(*near):
     return logs_by(ON_POLES, near)
 
 
-def logs_by(supports, near):
+def logs_by(shares, near):
     stopped = np.array([near, near], np.float64)
-    return _log_supports(stopped, N - stopped, supports)
+    return _log_supports(stopped, N - stopped, *shares)[0]
 
 
 @pytest.mark.parametrize(("n_near", "n_past"), [(0, 0), (3, 4), (40, 2)])
@@ -52,11 +51,12 @@ def test_what_stops_every_beam_from_some_row_on_is_a_head_or_a_boulder():
 
 
 def test_a_boulder_on_another_is_held_as_a_sphere_on_something_wide():
-    """Its stone widens below it as a cone does; the ground would begin higher up."""
-    stone = [0, 0, 0, 3, *[N] * 5]
-    perched, on_ground = (logs_by(supports_of(1.0, share), stone) for share in (1.0, 0.0))
-    assert perched[BOULDER] == pytest.approx(perched[SPHERE], abs=0.2)
-    assert on_ground[BOULDER] < on_ground[SPHERE]
+    """Its stone widens right below it; on legs, which begin farther down, no boulder stands."""
+    stone, legs = [0, 0, 3, *[N] * 6], [0, 0, 0, 0, 0, 0, *[N] * 3]
+    perched = logs_by((0.99, 0.99), stone)
+    assert perched[BOULDER] == pytest.approx(perched[SPHERE], abs=1.0)
+    on_legs = logs_by((0.99, 0.99), legs)
+    assert on_legs[SPHERE] > on_legs[BOULDER] + 5.0
 
 
 def test_shoulders_of_which_one_is_hidden_are_shoulders():
@@ -64,14 +64,14 @@ def test_shoulders_of_which_one_is_hidden_are_shoulders():
     stopped[1, 4:] = N
     seen = np.full((2, N_ROWS), float(N))
     seen[0] = 0.0
-    one_side = _log_supports(stopped, seen - stopped, ON_POLES)
+    one_side = _log_supports(stopped, seen - stopped, *ON_POLES)[0]
     assert np.argmax(one_side) == HEAD
 
 
 def test_what_is_wide_from_under_it_on_is_rather_a_crate_where_these_are_as_high():
     """Where only poles are, it is rather shoulders."""
     near = np.array([[0, 0, 0, *[N] * 6]] * 2, np.float64)
-    low, high = (_log_supports(near, N - near, one) for one in (ON_WIDE, ON_POLES))
+    low, high = (_log_supports(near, N - near, *one)[0] for one in (ON_WIDE, ON_POLES))
     assert low[SPHERE] - low[HEAD] > high[SPHERE] - high[HEAD] + 2.0
 
 
@@ -81,9 +81,24 @@ def test_what_is_neither_a_boulder_nor_a_head_is_held_as_a_sphere_is():
         np.testing.assert_array_equal(others, others[SPHERE])
 
 
+def test_beams_below_show_whether_something_wide_holds_a_place():
+    """However rare that is so high, and from where; rows that all let past show a pole."""
+    box, tripod, pole = np.zeros((3, 2, N_ROWS))
+    box[:, 1:], tripod[:, 5:] = N, N
+    on_box, on_tripod, on_pole = (
+        _log_supports(near, N - near, 0.01, 0.1)[1] for near in (box, tripod, pole)
+    )
+    assert (on_box[1:] > 0.99).all()
+    assert (on_tripod[5:] > 0.99).all()
+    assert (on_tripod[:5] < 0.01).all()
+    assert (on_pole < 0.001).all()
+
+
 def test_without_beams_below_nothing_is_known():
-    nothing = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)), ON_POLES)
+    nothing, held = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)), *ON_POLES)
     np.testing.assert_allclose(nothing, 0.0, atol=1e-9)
+    assert held[0] == 0.0
+    assert held[-1] == pytest.approx(0.9 * ON_POLES[0])  # or anything does
 
 
 def beams_below(level):
