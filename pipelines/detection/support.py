@@ -96,7 +96,7 @@ def _beams_below(evidence: Evidence, level: float, radius: float) -> tuple[Array
     n_past = past.sum()
     if evidence.silent is None:  # pulses are as dense below, and those without a return go past
         return near, past + max(evidence.n_on - near.sum() - n_past, 0.0) / past.size
-    return near, past - _n_unknown(evidence, level, radius)
+    return near, np.maximum(past - _n_unknown(evidence, level, radius), 0.0)
 
 
 def _n_unknown(evidence: Evidence, level: float, radius: float) -> Array:

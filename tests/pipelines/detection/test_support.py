@@ -101,7 +101,7 @@ def test_without_beams_below_nothing_is_known():
     assert held[-1] == pytest.approx(0.9 * ON_POLES[0])  # or anything does
 
 
-def beams_below(level):
+def beams_below(level, counted=1):
     """Silent beams below a place, by sides, and how many of them are known to go past.
 
     Ground is heard far to the left of it, and to the right where silent pulses are not known.
@@ -109,7 +109,7 @@ def beams_below(level):
     x, y = np.mgrid[-3.95:4.0:0.1, -2.5:-0.3:0.1].reshape(2, -1)
     is_heard = (x < -2.0) | (np.hypot(x, y) > 3.0)
     silent = np.array([x, y, 0.5 * np.ones(len(x))])[:, ~is_heard]
-    below = np.array([np.zeros((2, N_ROWS), np.int64), beside_pole(silent, 0.1)])
+    below = np.array([np.zeros((2, N_ROWS), np.int64), counted * beside_pole(silent, 0.1)])
     seen = Evidence(
         n_on=70, n_before=0, below=below, brightness=50.0, n_distinct=70,
         rows=np.empty(0, np.int32), seen=np.array([x, y, 0.0 * x])[:, is_heard], faces=np.empty(0),
@@ -127,3 +127,9 @@ def test_silence_below_shows_a_pole_only_where_ground_beside_it_is_heard():
 def test_silence_above_the_horizon_is_the_sky():
     silent, past = beams_below(5.0)
     np.testing.assert_array_equal(past, silent)
+
+
+def test_no_more_beams_are_unknown_than_are_counted():
+    """As where widths of a beam are known a little differently."""
+    _, past = beams_below(-5.0, counted=0)
+    np.testing.assert_array_equal(past, 0.0)
