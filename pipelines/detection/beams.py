@@ -187,9 +187,9 @@ def _behind(
     """Return ``behind`` and ``wide``.
 
     Low down, beams end as those do that pass farther to the sides at the same height: what a sphere
-    stands on may be wider than a pole. If it is, beams end as the others do that pass below.
-    ``on_wide`` is how probably each of these is one; ``beside`` the density of those that end near,
-    and the share of the others, higher up.
+    stands on may be wider than a pole. On something wide they end as the others on it do, too:
+    ``on_wide`` is how probably each beam is on it. ``beside`` is the density of those that end
+    near, and the share of the others, higher up.
     """
     density = np.where(kept[2] < NEAR, *beside)
     is_under = kept[1] < _LOWEST

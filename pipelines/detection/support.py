@@ -29,11 +29,12 @@ _ROWS = np.array([0.0, *(0.2,) * 3, *(0.08,) * 5])
 begins there, or widens farther down, as a cone does or a tripod."""
 
 # Probabilities that nothing is below, that anything is, and that something is from each row down:
-# shoulders begin within three radii below a head
+# shoulders begin within three radii below a head; a stone of two radii, round on top, is wider than
+# a pole's place 0.4 radii below a boulder, which is a quarter lower or higher than a sphere
 _ON_POLE = np.array([1.0 - _DOUBT, _DOUBT, *(0.0,) * 9])
 _ON_WIDE = np.array([0.001, _DOUBT, *((0.999 - _DOUBT) * _ROWS)])
 _ON_GROUND = np.array([0.005, 0.005, *(0.2475,) * 4, *(0.0,) * 5])
-_ON_ANOTHER = np.array([0.005, 0.005, 0.0, *(0.33,) * 3, *(0.0,) * 5])  # it is round on top
+_ON_ANOTHER = np.array([0.005, 0.005, 0.0, *(0.33,) * 3, *(0.0,) * 5])
 _SHOULDERS = np.array([0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0])
 
 
