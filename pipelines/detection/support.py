@@ -144,32 +144,31 @@ def _log_supported(near: Array, past: Array, support: Array, neighbour: float) -
 @compiled
 def _log_support(near: Array, past: Array, support: Array) -> float:
     """Return the log probability of the beams of some rows, by what holds a place up."""
-    n_near, n_past = near.sum(), past.sum()
-    found = log(support[0]) + _log_share(n_near, n_past, _OPEN)
-    found = np.logaddexp(found, log(support[1]) + _log_share(n_near, n_past, _ANY))
-    over, passed = 0.0, 0.0
-    for row in range(len(near)):
-        if support[2 + row] > 0.0:
-            begun = log(support[2 + row]) + _log_share(over, passed, _OPEN)
-            found = np.logaddexp(found, begun + _log_share(n_near - over, n_past - passed, _CLOSED))
-        over, passed = over + near[row], passed + past[row]
-    return float(found)
+    logs = _logs_of(near, past, support)
+    return float(logs.max() + np.log(np.exp(logs - logs.max()).sum()))
 
 
 @compiled
 def _shares_begun(near: Array, past: Array) -> Array:
     """Return how probably something wide, if it holds a place, has begun at each row, (9,)."""
+    logs = _logs_of(near, past, _ON_WIDE)
+    shares = np.exp(logs - logs.max())
+    return np.asarray(np.cumsum(shares[2:]) / shares.sum())
+
+
+@compiled
+def _logs_of(near: Array, past: Array, support: Array) -> Array:
+    """Return the log probabilities of the beams of some rows with each of a support, (2 + 9,)."""
     n_near, n_past, over, passed = near.sum(), past.sum(), 0.0, 0.0
-    anything = log(_DOUBT) + _log_share(n_near, n_past, _ANY)
-    logs = np.full(len(near), -np.inf)
+    logs = np.full(len(support), -np.inf)
+    logs[0] = log(support[0]) + _log_share(n_near, n_past, _OPEN)
+    logs[1] = log(support[1]) + _log_share(n_near, n_past, _ANY)
     for row in range(len(near)):
-        if _ROWS[row] > 0.0:
-            begun = log((1.0 - _DOUBT) * _ROWS[row]) + _log_share(over, passed, _OPEN)
-            logs[row] = begun + _log_share(n_near - over, n_past - passed, _CLOSED)
+        if support[2 + row] > 0.0:
+            begun = log(support[2 + row]) + _log_share(over, passed, _OPEN)
+            logs[2 + row] = begun + _log_share(n_near - over, n_past - passed, _CLOSED)
         over, passed = over + near[row], passed + past[row]
-    most = max(logs.max(), anything)
-    shares = np.exp(logs - most)
-    return np.asarray(np.cumsum(shares) / (shares.sum() + np.exp(anything - most)))
+    return logs
 
 
 @compiled

@@ -100,7 +100,7 @@ def test_without_beams_below_nothing_is_known():
     nothing, held = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)), *ON_POLES)
     np.testing.assert_allclose(nothing, 0.0, atol=1e-9)
     assert held[0] == 0.0
-    assert held[-1] == pytest.approx(0.9 * ON_POLES[0])  # or anything does
+    assert held[-1] == pytest.approx(0.899 * ON_POLES[0])  # or anything does, or nothing
 
 
 def beams_below(level, counted=1):
