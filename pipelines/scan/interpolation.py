@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from spheremark.pipelines.estimation.robust import robust_sigma
-from spheremark.pipelines.model import Array, Column, Index, Timed
+from spheremark.pipelines.model import Array, Column, Index, Mask, Timed
 
 _N_SAMPLES = 10  # of the gimbal's angle, from which their scatter is known
 # times that scatter: changes of the slope at both samples, and at each; they scatter by 3 times it
 _CORNER, _NOISE = 12.0, 3.0
+_SLOW, _SLOWER = 0.25, 2.0  # share of samples at which one that goes by steps rests; their speed
+_WITHIN, _NORMAL = 0.95, 1.96  # share of normal numbers within so many standard deviations
 
 
 def scatter_of_angles(angles: Timed | Column, unknown: float) -> float:
@@ -26,14 +27,24 @@ def scatter_of_angles(angles: Timed | Column, unknown: float) -> float:
     -------
     float
         Standard deviation [rad].
+
+    Notes
+    -----
+    By the samples where the gimbal is slow: one that goes by steps starts and stops elsewhere.
     """
     if not isinstance(angles, Timed) or len(angles.values) < _N_SAMPLES:
         return unknown
     times, values = angles.samples_ns.astype(np.float64), angles.values
     shares = (times[1:-1] - times[:-2]) / (times[2:] - times[:-2])
     off = values[1:-1] - values[:-2] - shares * (values[2:] - values[:-2])
+    off = np.abs(off[_is_slow((values[2:] - values[:-2]) / (times[2:] - times[:-2]))])
     # of noise s the difference has 1.5 s^2, and an angle between two samples 2/3 s^2 in the mean
-    return 2.0 / 3.0 * robust_sigma(off[np.isfinite(off)])
+    return 2.0 / 3.0 * float(np.quantile(off, _WITHIN)) / _NORMAL
+
+
+def _is_slow(speeds: Array) -> Mask:
+    """Return where a gimbal rests, if it goes by steps; most of an even turn."""
+    return np.asarray(np.abs(speeds) <= _SLOWER * np.nanquantile(np.abs(speeds), _SLOW))
 
 
 def speeds_of(angles: Timed | Column, rows: Index) -> Array:

@@ -5,7 +5,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from spheremark.pipelines.model import Timed
-from spheremark.pipelines.scan.interpolation import errors_of_interpolation, speeds_of
+from spheremark.pipelines.scan.interpolation import (
+    errors_of_interpolation,
+    scatter_of_angles,
+    speeds_of,
+)
 
 REST, MOVE, SPEED, PERIOD = 0.1, 0.05, 1.7, 9_300_000  # [s], [s], [rad/s], [ns] between samples
 
@@ -16,11 +20,12 @@ def stepped_angle(times):
     return SPEED * (n * MOVE + np.maximum(within - REST, 0.0))
 
 
-def sampled(angle, scatter=0.0):
-    """Angles of returns between samples of a movement."""
+def sampled(angle, scatter=0.0, step=0.0):
+    """Angles of returns between samples of a movement, which an encoder rounds."""
     samples = np.arange(0, 3_000_000_000, PERIOD)
     noise = scatter * np.random.default_rng(4).standard_normal(len(samples))
     values = angle(1e-9 * samples) + noise
+    values = np.round(values / step) * step if step else values
     rates = np.append(np.diff(values) / PERIOD, 0.0)
     stamps = np.arange(50_000_000, 2_900_000_000, 137_000)
     return Timed(stamps, samples, values, rates)
@@ -55,6 +60,22 @@ def test_an_even_or_rippling_turn_has_no_corners(angle):
     column = sampled(angle, scatter=5e-5)
     assert not errors_of_interpolation(column, np.arange(len(column))).any()
     assert not errors_of_interpolation(column[:], np.arange(len(column))).any()
+
+
+def hurried_angle(times):
+    """Angle of a gimbal that moves, smoothly, for three fifths of the time [rad]."""
+    n, within = np.divmod(times, 0.1)
+    share = np.clip(within - 0.04, 0.0, None) / 0.06
+    return 0.05 * (n + 0.5 - 0.5 * np.cos(np.pi * share))
+
+
+@pytest.mark.parametrize("angle", [lambda times: 0.47 * times, stepped_angle, hurried_angle])
+@pytest.mark.parametrize(("jitter", "step"), [(1e-4, 0.0), (1e-4, 2e-4), (2e-4, 4e-4)])
+def test_the_scatter_is_that_of_the_encoder_however_the_gimbal_moves(angle, jitter, step):
+    column = sampled(angle, jitter, step)
+    # noise s is 2/3 s^2 between two samples, in the mean; rounding adds a twelfth of a step squared
+    expected = np.sqrt(2.0 / 3.0) * np.hypot(jitter, step / np.sqrt(12.0))
+    assert scatter_of_angles(column, np.nan) == pytest.approx(expected, rel=0.3)
 
 
 def test_speeds_are_those_between_the_samples_and_none_without_samples():
