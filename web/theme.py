@@ -27,6 +27,7 @@ PAPER = "var(--paper)"
 PAPER_BAND = "var(--paper-band)"
 GREEN = "var(--third)"
 GREEN_BAND = "var(--third-band)"
+FIFTH = "var(--fifth)"
 AXES = {"x": "var(--axis-x)", "y": "var(--axis-y)", "z": "var(--axis-z)"}
 TOLERANCE = "var(--tolerance)"
 MARK = "var(--mark)"
@@ -57,7 +58,7 @@ _METHODS = {
     "paper": Style("paper's method", PAPER, "diamond", PAPER_BAND),
     "silhouette": Style("silhouette", GREEN, "square", GREEN_BAND),
     "astm_e3125": Style("astm e3125", "var(--fourth)", "triangle-up", GREEN_BAND),
-    "free_radius": Style("free radius", "var(--fifth)", "triangle-down", GREEN_BAND),
+    "free_radius": Style("free radius", FIFTH, "triangle-down", GREEN_BAND),
     "algebraic": Style("algebraic", "var(--sixth)", "pentagon", GREEN_BAND),
 }
 

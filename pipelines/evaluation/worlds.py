@@ -44,6 +44,7 @@ from spheremark.pipelines.model import (
 from spheremark.pipelines.positioning.resection import resect
 from spheremark.pipelines.scan.stitching import beams, choose_rig, stitch
 from spheremark.pipelines.simulation import random_world
+from spheremark.pipelines.simulation.stands import GROUND, POLE
 from spheremark.pipelines.simulation.worlds import PRIORS, Scan
 from spheremark.pipelines.sphere import fit_markers
 from spheremark.pipelines.sphere.bound import cramer_rao
@@ -68,9 +69,10 @@ CLASSES = (
     f"{N_FEW} returns or more, on one scan line",
     "fewer returns, or mostly hidden",
     f"on the ground, {N_FEW} returns or more",
+    f"on something wide, {N_MANY} returns or more",
 )
-"""Classes of markers by returns and visible share; the first two stand on poles, and lie on two
-scan lines or more, as do the last."""
+"""Classes of markers by returns, visible share and what they stand on: the first is on poles. All
+but the third and the fourth lie on two scan lines or more and are half visible."""
 
 PROBABILITIES = (0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 1.0)
 """Edges of the classes of probability for which its calibration is shown."""
@@ -87,7 +89,6 @@ _METHOD, _RESECTION = "along_beam", "free_station"
 _MEAN_DEPTH = 2.0 / 3.0  # of a sphere's radius: mean height of its surface over its disc
 _NEAREST_MATCH = 0.06  # [m] at the least, within which a candidate is at a marker
 _DECOY_REACH = 0.1  # [m] beyond a decoy and a marker's radius, within which a false one is at it
-_ON_GROUND = 0.1  # [m] above the ground that the lowest point of a marker lies that is on no pole
 _NOWHERE = "ground, scattered rocks"
 
 
@@ -275,11 +276,12 @@ def _class_of(scan: Scan, mark: int) -> str:
         return CLASSES[3]
     if n_lines < N_LINES:
         return CLASSES[2]
-    field = scan.world.field
-    place, radius = field.marks.p_site[mark], field.marker_radius
-    if float(place[2] - field.terrain.height_at(place)) < radius + _ON_GROUND:
+    stand = scan.world.field.stands[mark]
+    if stand == GROUND:
         return CLASSES[4]
-    return CLASSES[0] if n >= N_MANY else CLASSES[1]
+    if n < N_MANY:
+        return CLASSES[1]
+    return CLASSES[0] if stand == POLE else CLASSES[5]
 
 
 def _places(scan: Scan, cloud: StitchedCloud, rows: Index) -> Array:

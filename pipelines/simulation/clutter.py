@@ -16,7 +16,7 @@ from spheremark.pipelines.simulation import objects
 from spheremark.pipelines.simulation.bodies import box
 from spheremark.pipelines.simulation.field import Decoy, Field, Stop, paper_field
 from spheremark.pipelines.simulation.objects import WALL_SHADE, Builder, Item, Site
-from spheremark.pipelines.simulation.scene import Mesh, Poles, Scene, Spheres
+from spheremark.pipelines.simulation.scene import Mesh, Scene, Spheres
 
 _STOP_CLEAR = 0.9  # [m] from a stop to the nearest item
 _MARK_CLEAR = 0.45  # [m] from a marker to the nearest item that is placed by chance
@@ -145,11 +145,6 @@ def with_items(world: Field, scenario: str, items: Sequence[Item]) -> Field:
         radii=np.append(scene.spheres.radii, [radius for _, radius, _ in balls]),
         reflectivities=np.append(scene.spheres.reflectivities, [shade for _, _, shade in balls]),
     )
-    poles = Poles(
-        feet_site=np.vstack([scene.poles.feet_site, *(foot for foot, _, _ in sticks)]),
-        tops_site=np.vstack([scene.poles.tops_site, *(top for _, top, _ in sticks)]),
-        radii=np.append(scene.poles.radii, [radius for _, _, radius in sticks]),
-    )
     mesh = Mesh.merged([scene.mesh, *(mesh for item in items for mesh in item.meshes)])
     decoys = tuple(
         Decoy(name=f"X{i + 1:03d}", kind=item.kind, p_site=np.array(item.p_site), reach=item.reach)
@@ -158,7 +153,7 @@ def with_items(world: Field, scenario: str, items: Sequence[Item]) -> Field:
     return replace(
         world,
         scenario=scenario,
-        scene=Scene(mesh=mesh, spheres=spheres, poles=poles),
+        scene=Scene(mesh=mesh, spheres=spheres, poles=scene.poles.joined(sticks)),
         decoys=decoys,
     )
 

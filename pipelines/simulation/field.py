@@ -114,6 +114,8 @@ class Field:
         Objects that might be mistaken for a marker; for comparison only.
     family : str
         What is particular about a random world; empty for the others.
+    stands : tuple of str
+        What each marker stands on, in a random world.
     """
 
     scenario: str
@@ -125,6 +127,7 @@ class Field:
     stops: tuple[Stop, ...]
     decoys: tuple[Decoy, ...] = ()
     family: str = ""
+    stands: tuple[str, ...] = ()
 
     def stop(self, name: str) -> Stop:
         """Return the stop of a name.
@@ -187,23 +190,24 @@ def paper_field(seed: int) -> Field:
 
 def marker_surfaces(
     p_site: Array,
-    terrain: Terrain,
+    feet: Array,
     radius: float = MARKER_RADIUS,
     pole_radius: float = _POLE_RADIUS,
     shade: float = _MARKER_SHADE,
 ) -> tuple[Mesh, Spheres, Poles]:
-    """Return markers on their poles."""
+    """Return markers on their poles, which begin at some heights [m]."""
     n = len(p_site)
-    feet, tops = p_site.copy(), p_site.copy()
-    feet[:, 2] = terrain.height_at(p_site)
+    feet_site, tops = p_site.copy(), p_site.copy()
+    feet_site[:, 2] = feet
     tops[:, 2] -= np.sqrt(radius**2 - pole_radius**2)
     meshes = [
-        pole_mesh(foot, top, pole_radius, _POLE_SHADE) for foot, top in zip(feet, tops, strict=True)
+        pole_mesh(foot, top, pole_radius, _POLE_SHADE)
+        for foot, top in zip(feet_site, tops, strict=True)
     ]
     spheres = Spheres(
         p_site=p_site.copy(), radii=np.full(n, radius), reflectivities=np.full(n, shade)
     )
-    poles = Poles(feet_site=feet, tops_site=tops, radii=np.full(n, pole_radius))
+    poles = Poles(feet_site=feet_site, tops_site=tops, radii=np.full(n, pole_radius))
     return Mesh.merged(meshes), spheres, poles
 
 
@@ -279,5 +283,5 @@ def _scene(seed: int, terrain: Terrain, p_site: Array, keep_clear: Array) -> Sce
     rng = np.random.default_rng([seed, _ROCKS])
     ground = terrain_mesh(np.random.default_rng([seed, _SHADES]), terrain)
     rocks = rock_mesh(rng, draw_rocks(rng, keep_clear), terrain)
-    posts, spheres, poles = marker_surfaces(p_site, terrain)
+    posts, spheres, poles = marker_surfaces(p_site, terrain.height_at(p_site))
     return Scene(mesh=Mesh.merged([ground, rocks, posts]), spheres=spheres, poles=poles)

@@ -47,7 +47,7 @@ def range_lane(
     lines = np.linspace(-_HALF, _HALF, 81)
     terrain = Terrain(xs=lines, ys=lines.copy(), heights=np.zeros((81, 81)))
     p_site = _ring(rng, distances, per_distance)
-    posts, spheres, poles = marker_surfaces(p_site, terrain)
+    posts, spheres, poles = marker_surfaces(p_site, terrain.height_at(p_site))
     names = tuple(f"D{d * 10:03.0f}-{i + 1}" for i in range(per_distance) for d in distances)
     heading = float(rng.uniform(-np.pi, np.pi))
     return Field(

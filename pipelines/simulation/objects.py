@@ -17,7 +17,8 @@ from spheremark.pipelines.model import Array
 from spheremark.pipelines.simulation.bodies import box, cylinder, ellipsoid, leaves
 from spheremark.pipelines.simulation.field import MARKER_RADIUS
 from spheremark.pipelines.simulation.rocks import round_rock
-from spheremark.pipelines.simulation.scene import Mesh, pole_mesh
+from spheremark.pipelines.simulation.scene import Mesh, Stick, pole_mesh
+from spheremark.pipelines.simulation.stands import draw_stand
 from spheremark.pipelines.simulation.terrain import Terrain
 
 _HEAD_RADII = (0.10, 0.12)  # [m]
@@ -29,8 +30,6 @@ WRONG_RADII = ((0.7, 0.9), (1.1, 1.5))
 WALL_SHADE = 0.40
 _CLOTH_SHADE, _SKIN_SHADE = 0.30, 0.50
 _BARK_SHADE, _BALL_SHADE, _PIPE_SHADE, _PAINT_SHADE = 0.25, 0.50, 0.35, 0.45
-
-Stick = tuple[Array, Array, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -154,9 +153,14 @@ def lying_pipe(rng: np.random.Generator, foot: Array, site: Site) -> Item:
     return Item(kind="pipe", p_site=middle, meshes=[mesh])
 
 
-def _pole(terrain: Terrain, top: Array, radius: float) -> tuple[Mesh, tuple[Array, Array, float]]:
-    """Return a thin pole up to a place, and its axis."""
-    foot = np.array([top[0], top[1], terrain.height_at(top)])
+def _pole(terrain: Terrain, top: Array, radius: float) -> tuple[Mesh, Stick]:
+    """Return a thin pole from the ground up to a place, and its axis."""
+    return _rod(float(terrain.height_at(top)), top, radius)
+
+
+def _rod(z: float, top: Array, radius: float) -> tuple[Mesh, Stick]:
+    """Return a thin pole from a height up to a place, and its axis."""
+    foot = np.append(top[:2], z)
     return pole_mesh(foot, top, radius, _PIPE_SHADE), (foot, top, radius)
 
 
@@ -283,35 +287,35 @@ def _wrong_size(rng: np.random.Generator, site: Site) -> float:
 
 
 def _raised(rng: np.random.Generator, foot: Array, half: float) -> Array:
-    """Return the middle of a decoy of a half height on a pole."""
+    """Return the middle of a decoy of a half height that is not on the ground."""
     return above(foot, half + rng.uniform(0.5, 1.6))
 
 
 def wrong_ball(rng: np.random.Generator, foot: Array, site: Site) -> Item:
-    """Return a ball of the wrong size on a pole or on the ground."""
+    """Return a ball of the wrong size, raised or on the ground."""
     radius = _wrong_size(rng, site)
     if rng.random() < 0.3:
         return ball_on_ground(radius)(rng, foot, site)
     centre = _raised(rng, foot, radius)
-    mesh, stick = _pole(site.terrain, above(centre, -0.98 * radius), _stem(rng, radius))
+    meshes, sticks = _holding(rng, centre, radius, site)
     balls = [(centre, radius, _BALL_SHADE)]
-    return Item(kind="wrong ball", p_site=centre, meshes=[mesh], balls=balls, sticks=[stick])
+    return Item(kind="wrong ball", p_site=centre, meshes=meshes, balls=balls, sticks=sticks)
 
 
 def cube(rng: np.random.Generator, foot: Array, site: Site) -> Item:
-    """Return a cuboid about as large as a marker, on a pole or on the ground."""
+    """Return a cuboid about as large as a marker, raised or on the ground."""
     sides = 2.0 * site.radius * rng.uniform(0.7, 1.5) * rng.uniform(0.8, 1.2, 3)
     on_ground = rng.random() < 0.3
     middle = above(foot, sides[2] / 2) if on_ground else _raised(rng, foot, sides[2] / 2)
     meshes = [box(middle, sides, rng.uniform(-np.pi, np.pi), _PAINT_SHADE)]
     if on_ground:
         return Item(kind="cube", p_site=middle, meshes=meshes)
-    mesh, stick = _pole(site.terrain, middle, _stem(rng, sides[2] / 2))
-    return Item(kind="cube", p_site=middle, meshes=[*meshes, mesh], sticks=[stick])
+    more, sticks = _holding(rng, middle, sides[2] / 2, site)
+    return Item(kind="cube", p_site=middle, meshes=meshes + more, sticks=sticks)
 
 
 def drum(rng: np.random.Generator, foot: Array, site: Site) -> Item:
-    """Return an upright or lying cylinder about as large as a marker, on a pole or the ground."""
+    """Return an upright or lying cylinder about as large as a marker, raised or on the ground."""
     radius, half = site.radius * rng.uniform(0.7, 1.5, 2)
     on_ground, lies = rng.random() < 0.3, rng.random() < 0.3
     up = radius if lies else half
@@ -321,8 +325,18 @@ def drum(rng: np.random.Generator, foot: Array, site: Site) -> Item:
     meshes = [cylinder(middle - axis, middle + axis, radius, _PAINT_SHADE)]
     if on_ground:
         return Item(kind="cylinder", p_site=middle, meshes=meshes)
-    mesh, stick = _pole(site.terrain, middle, _stem(rng, radius))
-    return Item(kind="cylinder", p_site=middle, meshes=[*meshes, mesh], sticks=[stick])
+    more, sticks = _holding(rng, middle, up, site)
+    return Item(kind="cylinder", p_site=middle, meshes=meshes + more, sticks=sticks)
+
+
+def _holding(
+    rng: np.random.Generator, middle: Array, below: float, site: Site
+) -> tuple[list[Mesh], list[Stick]]:
+    """Return what holds a decoy that reaches down to a depth below its middle [m]."""
+    stem, (own,) = _stem(rng, below), rng.spawn(1)
+    stand = draw_stand(own, site.terrain, above(middle, -below), below, stem)
+    mesh, stick = _rod(stand.z, above(middle, -0.98 * below), stem)
+    return [mesh, *stand.meshes], [stick, *stand.sticks]
 
 
 def _stem(rng: np.random.Generator, radius: float) -> float:

@@ -19,6 +19,8 @@ _ROUND_LEVEL = 2  # of nearly round rocks: flats lie 1 mm inside a ball of 0.1 m
 _N_FACETS = 9  # planes that a rock is cut by
 _BURIED = 0.3  # share of a rock's half height that its centre lies above ground
 _REFLECTIVITY = (0.10, 0.22)
+_CROWN, _DEPTHS = 0.25, (0.0, 0.8)  # radii: about its top; depth of its ground below its middle
+_WIDEST = 1.4  # [m] radius
 
 
 def draw_rocks(rng: np.random.Generator, keep_clear: Array, cover: float = _COVER) -> Array:
@@ -82,6 +84,16 @@ def round_rock(rng: np.random.Generator, centre: Array, radius: float) -> Mesh:
     directions, triangles = ball(_ROUND_LEVEL)
     shape = _shape(rng, directions, is_round=True) * radius
     return Mesh.even(shape + centre, triangles, rng.uniform(*_REFLECTIVITY))
+
+
+def standing_rock(rng: np.random.Generator, top: Array, height: float) -> Mesh:
+    """Return a rock that rises to a place from the ground, up to 1.7 m below."""
+    directions, triangles = ball(_ROUND_LEVEL)
+    shape = _shape(rng, directions, is_round=rng.random() < _ROUND_SHARE)
+    highest = float(shape[np.hypot(*shape[:, :2].T) < _CROWN, 2].max())
+    size = min(height / (highest + rng.uniform(*_DEPTHS)), _WIDEST)
+    centre = top - np.array([0.0, 0.0, size * highest])
+    return Mesh.even(size * shape + centre, triangles, rng.uniform(*_REFLECTIVITY))
 
 
 def ball(level: int) -> tuple[Array, Index]:

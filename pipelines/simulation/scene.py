@@ -108,6 +108,10 @@ class Spheres:
         seal(self, p_site=(n, 3), radii=(n,), reflectivities=(n,))
 
 
+Stick = tuple[Array, Array, float]
+"""Foot, top and radius of a thin pole."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Poles:
     """Axes of thin poles: beams that touch them are traced as bundles.
@@ -127,6 +131,25 @@ class Poles:
     def __post_init__(self) -> None:
         n = len(self.radii)
         seal(self, feet_site=(n, 3), tops_site=(n, 3), radii=(n,))
+
+    def joined(self, sticks: Sequence[Stick]) -> Poles:
+        """Return these poles and more.
+
+        Parameters
+        ----------
+        sticks : sequence of (foot, top, radius)
+            Axes and radii of the others [m].
+
+        Returns
+        -------
+        Poles
+            All of them, these first.
+        """
+        return Poles(
+            feet_site=np.vstack([self.feet_site, *(foot for foot, _, _ in sticks)]),
+            tops_site=np.vstack([self.tops_site, *(top for _, top, _ in sticks)]),
+            radii=np.append(self.radii, [radius for _, _, radius in sticks]),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

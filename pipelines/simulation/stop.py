@@ -238,6 +238,7 @@ def survey_truth(
                 }
                 for decoy in field.decoys
             ],
+            "stands": dict(zip(field.marks.names, field.stands, strict=False)),
             "visible_shares": {stop.truth.name: _shares(field, stop) for stop in stops},
             "returns": {
                 stop.truth.name: {

@@ -25,6 +25,7 @@ from spheremark.pipelines.simulation.options import Optics, Pick, Profile, Simul
 from spheremark.pipelines.simulation.rig import commensurability
 from spheremark.pipelines.simulation.rocks import draw_rocks, rock_mesh
 from spheremark.pipelines.simulation.scene import Mesh, Scene, terrain_mesh
+from spheremark.pipelines.simulation.stands import Stand, draw_stand
 from spheremark.pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
 from spheremark.pipelines.simulation.terrain import Terrain, rough_terrain
 
@@ -342,22 +343,27 @@ def _field(values: _Values, seed: int, family: str, config: SimulationConfig) ->
     marks[:, 2] = _heights(rng, marks, terrain, radius)
     shade = values["shade"]
     stem = float(np.clip(radius * rng.uniform(0.08, 0.3), 0.004, 0.15))
-    posts, spheres, poles = marker_surfaces(marks, terrain, radius, stem, shade)
+    stands = _stands(np.random.default_rng([seed, _ITEMS, 2]), marks, terrain, (radius, stem))
+    feet = np.array([stand.z for stand in stands])
+    posts, spheres, poles = marker_surfaces(marks, feet, radius, stem, shade)
     clear = [(s.p_site[0], s.p_site[1], _STOP_CLEAR) for s in stops]
     clear += [(x, y, radius + 0.4) for x, y, _ in marks]
     lies = np.random.default_rng([seed, _LAND, 1])
     rocks = rock_mesh(lies, draw_rocks(lies, np.array(clear), values["cover"]), terrain)
-    mesh = Mesh.merged([terrain_mesh(lies, terrain), _skirt(terrain), rocks, posts])
+    wide = [mesh for stand in stands for mesh in stand.meshes]
+    sticks = [stick for stand in stands for stick in stand.sticks]
+    mesh = Mesh.merged([terrain_mesh(lies, terrain), _skirt(terrain), rocks, posts, *wide])
     names = tuple(f"P{i + 1:02d}" for i in range(len(marks)))
     world = Field(
         scenario="random",
         seed=seed,
         terrain=terrain,
-        scene=Scene(mesh=mesh, spheres=spheres, poles=poles),
+        scene=Scene(mesh=mesh, spheres=spheres, poles=poles.joined(sticks)),
         marks=ControlMarks(names=names, p_site=marks, cov_p_site=np.zeros((len(marks), 3, 3))),
         marker_radius=radius,
         stops=stops,
         family=family,
+        stands=tuple(stand.kind for stand in stands),
     )
     items = _items(np.random.default_rng([seed, _ITEMS]), world, family, farthest)
     if family in ("clutter", _ALL):
@@ -409,10 +415,18 @@ def _marks(rng: np.random.Generator, n: int, radius: float, farthest: float) -> 
 
 
 def _heights(rng: np.random.Generator, marks: Array, terrain: Terrain, radius: float) -> Array:
-    """Draw heights of markers: most on poles, some on the ground [m]."""
+    """Draw heights of markers: most are raised, some lie on the ground [m]."""
     n = len(marks)
     above = radius + np.where(rng.random(n) < 0.1, 0.02, rng.uniform(0.3, 1.6, n))
     return np.asarray(terrain.height_at(marks) + above)
+
+
+def _stands(
+    rng: np.random.Generator, marks: Array, terrain: Terrain, radii: tuple[float, float]
+) -> list[Stand]:
+    """Draw what markers stand on; ``radii`` are those of a marker and of its pole [m]."""
+    lowest = marks - np.array([0.0, 0.0, radii[0]])
+    return [draw_stand(rng, terrain, place, *radii) for place in lowest]
 
 
 def _clearances(marks: Array, radius: float) -> Array:

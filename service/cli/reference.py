@@ -98,7 +98,9 @@ def _priors() -> Iterator[str]:
         f"{', '.join(FAMILIES)}.\n"
         "Besides: an even, Gaussian or two-lobed footprint; the strongest, first or last echo; "
         "with or without the cosine of\nincidence; constant noise or noise by reflectivity; no "
-        "divergence in 15 % of the worlds where optics are wide.\n"
+        "divergence in 15 % of the worlds where optics are wide.\nMarkers and decoys are on poles, "
+        "one in ten on the ground, and three in ten of the others on a\ncrate, a drum, a rock, a "
+        "table or a tripod.\n"
     )
     yield "| quantity | meaning | usual | wide | wide in |\n|---|---|---|---|---|"
     for name, prior in PRIORS.items():

@@ -43,5 +43,10 @@ def test_the_curve_marks_the_working_point(report):
     assert diamond.y == (50.0,)
 
 
+def test_reports_of_fewer_classes_of_markers_are_still_drawn(report):
+    older = report | {"markers": report["markers"][:-1]}
+    assert len(curve_figure(older).data) == len(curve_figure(report).data)
+
+
 def test_without_a_report_the_page_names_the_command():
     assert "bench --worlds" in worlds_page(FRAME, None)

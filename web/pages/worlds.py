@@ -12,7 +12,7 @@ from spheremark.web.figures.elements import add_line, add_points, blank_figure
 from spheremark.web.pages.base import Frame, Panel
 from spheremark.web.templating import render
 
-_COLOURS = (theme.OURS, theme.PAPER, theme.TEXT, theme.TOLERANCE, theme.GREEN)
+_COLOURS = (theme.OURS, theme.PAPER, theme.TEXT, theme.TOLERANCE, theme.GREEN, theme.FIFTH)
 _CURVE = (
     "Share of markers found against false markers in a scan, as the level of decision falls. "
     "Diamonds: the markers that are called ok."
@@ -37,7 +37,7 @@ def curve_figure(report: Mapping[str, Any]) -> go.Figure:
     )
     rates = [one["rate"] for one in report["curve"]]
     working = next(one for one in report["methods"] if one["method"] == "ok")["false_per_scan"]
-    for i, (marker, colour) in enumerate(zip(report["markers"], _COLOURS, strict=True)):
+    for i, (marker, colour) in enumerate(zip(report["markers"], _COLOURS, strict=False)):
         if not marker["n"]:
             continue
         shares = [100 * one[f"recall_{i}"] for one in report["curve"]]

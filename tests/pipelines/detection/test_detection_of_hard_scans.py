@@ -11,6 +11,7 @@ from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import StitchedCloud
 from spheremark.pipelines.scan.stitching import choose_rig, stitch
 from spheremark.pipelines.simulation import random_world
+from spheremark.pipelines.simulation.stands import POLE
 from spheremark.pipelines.simulation.worlds import family_of
 from tests.pipelines.synthetic_stop import RADIUS, World, scan
 
@@ -122,8 +123,13 @@ def test_markers_of_a_stepped_scan_are_found_and_nothing_else():
     places = transform(inverse(world.stop.truth.T_site_base), field.marks.p_site)
     well_seen = np.array([n >= 20 and lines > 2 for n, lines in world.stop.counts])
     well_seen &= np.linalg.norm(places, axis=1) < config.range_max
-    assert sum(well_seen) > 1
-    assert gaps(places[well_seen], found).min(axis=1).max() < field.marker_radius
+    on_pole = np.array([stand == POLE for stand in field.stands])
+    assert sum(well_seen & on_pole) > 1
+    assert gaps(places[well_seen & on_pole], found).min(axis=1).max() < field.marker_radius
+    possible = np.array([one.p_base for one in found.possible]).reshape(-1, 3)
+    rough = np.vstack([possible, *(one.p_base_rough for one in found.candidates)])
+    away = np.linalg.norm(places[well_seen, None] - rough, axis=2).min(axis=1)
+    assert away.max() < field.marker_radius, "on a drum it is a possible one at least"
     assert gaps(places, found).min(axis=0).max() < field.marker_radius
     compared = [one.probability for one in found.rejected if not np.isnan(one.probability)]
     assert len(compared) > 5

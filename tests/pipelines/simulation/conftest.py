@@ -15,7 +15,7 @@ def plain() -> Field:
     """Level ground at height zero, three markers and two stops."""
     lines = np.array([-30.0, 0.0, 30.0])
     terrain = Terrain(xs=lines, ys=lines.copy(), heights=np.zeros((3, 3)))
-    posts, spheres, poles = marker_surfaces(MARKS.copy(), terrain)
+    posts, spheres, poles = marker_surfaces(MARKS.copy(), terrain.height_at(MARKS))
     ground = terrain_mesh(np.random.default_rng(0), terrain)
     stops = tuple(
         Stop(name=name, p_site=np.array([x, 0.2, 1.0]), heading=0.3)

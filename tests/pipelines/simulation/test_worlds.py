@@ -11,8 +11,12 @@ from spheremark.pipelines.errors import ConfigError
 from spheremark.pipelines.model import RING_UNKNOWN
 from spheremark.pipelines.scan.rigs import rig_digest
 from spheremark.pipelines.simulation import FAMILIES, commensurability, draw_world, random_world
+from spheremark.pipelines.simulation.objects import Site, cube, drum, wrong_ball
 from spheremark.pipelines.simulation.options import Optics, Profile, SimulationConfig
 from spheremark.pipelines.simulation.rig import nominal_rig, true_rig
+from spheremark.pipelines.simulation.scene import caster
+from spheremark.pipelines.simulation.stands import draw_stand
+from spheremark.pipelines.simulation.terrain import rough_terrain
 from spheremark.pipelines.simulation.worlds import PRIORS, family_of
 from spheremark.storage.recordings import write_log
 
@@ -152,6 +156,64 @@ def test_a_seed_gives_one_world_and_another_seed_another(scan):
     assert other.field.marks.names != scan.world.field.marks.names or not np.array_equal(
         other.field.marks.p_site, scan.world.field.marks.p_site
     )
+
+
+def test_three_in_ten_raised_markers_stand_on_something_wide_right_below_them():
+    kinds = Counter[str]()
+    for seed in range(0, 80, 2):
+        field = draw_world(seed).field
+        marks, radius = field.marks.p_site, field.marker_radius
+        kinds.update(field.stands)
+        down = np.column_stack([marks, np.tile([0.0, 0.0, -1.0], (len(marks), 1))])
+        below = caster(field.scene.mesh)(down.astype(np.float32))[0] - radius
+        for kind, gap in zip(field.stands, below, strict=True):
+            limit = {"pole": np.inf, "rock": 0.5}.get(kind, 0.16)
+            assert -0.01 < gap < limit, f"seed {seed}: a marker hangs above its {kind}"
+        stops = np.array([stop.p_site[:2] for stop in field.stops])
+        near = np.linalg.norm(marks[:, None, :2] - stops, axis=2) - radius
+        assert near.min(initial=np.inf) > 1.7
+    wide = {"crate", "drum", "rock", "table", "tripod"}
+    assert set(kinds) == wide | {"pole", "ground"}
+    n = sum(kinds[kind] for kind in wide)
+    assert n / (n + kinds["pole"]) == pytest.approx(0.3, abs=0.07)
+    assert min(kinds[kind] for kind in wide) > 0.1 * n
+
+
+def test_what_a_marker_stands_on_hides_little_of_it_and_nothing_lies_in_it():
+    rng = np.random.default_rng(3)
+    ground = rough_terrain(rng)
+    for _ in range(60):
+        centre = np.append(rng.uniform(-9.0, 9.0, 2), 0.0)
+        centre[2] = ground.height_at(centre) + rng.uniform(0.4, 1.7)
+        lowest = centre - np.array([0.0, 0.0, 0.1])
+        stand = draw_stand(rng, ground, lowest, 0.1, 0.02)
+        assert stand.kind != "ground"
+        for mesh in stand.meshes:
+            assert np.linalg.norm(mesh.p_site - centre, axis=1).min() > 0.095
+            assert mesh.p_site[:, 2].max() < lowest[2] + 0.05
+            away = np.linalg.norm((mesh.p_site - centre)[:, :2], axis=1).max()
+            assert away < 1.5, "stops keep 1.8 m away from a marker"
+        for foot, top, radius in stand.sticks:
+            assert radius < 0.05
+            assert foot[2] < top[2] < centre[2]
+    centre[2] = ground.height_at(centre) + 0.02
+    assert draw_stand(rng, ground, centre, 0.1, 0.02).kind == "ground"
+
+
+def test_decoys_stand_on_the_same_things_as_markers():
+    site = Site(terrain=rough_terrain(np.random.default_rng(1)))
+    for builder in (wrong_ball, cube, drum):
+        rngs = (np.random.default_rng([seed, 7]) for seed in range(60))
+        raised = [item for rng in rngs if (item := builder(rng, np.zeros(3), site)).sticks]
+        n_legs = Counter(len(item.sticks) - 1 for item in raised)
+        assert set(n_legs) == {0, 3, 4}, "on a pole, a tripod and a table"
+        assert n_legs[0] > 3 * (n_legs[3] + n_legs[4])
+
+
+def test_the_truth_says_what_each_marker_stands_on(scan):
+    stands = scan.truth.about["stands"]
+    assert list(stands) == list(scan.world.field.marks.names)
+    assert tuple(stands.values()) == scan.world.field.stands
 
 
 def test_a_bare_log_has_no_rings():
