@@ -64,6 +64,9 @@ class Beams(NamedTuple):
         Half the width of a beam across and up, as ``Evidence.widths``.
     lost, faintest : float
         Share of the pulses on a surface that are not heard, and of a beam that must be on it.
+    plumb : float, float
+        How much deeper beams end on what is upright below the place: times how far up they pass,
+        and times its square.
     """
 
     x: Array
@@ -79,6 +82,7 @@ class Beams(NamedTuple):
     widths: Array
     lost: float
     faintest: float
+    plumb: tuple[float, float] = (0.0, 0.0)
 
 
 def beams_about(

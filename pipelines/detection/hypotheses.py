@@ -38,7 +38,7 @@ from spheremark.pipelines.detection.shapes import (
     log_likelihood,
 )
 from spheremark.pipelines.detection.support import log_supports
-from spheremark.pipelines.detection.target import Target
+from spheremark.pipelines.detection.target import Target, slope_of
 from spheremark.pipelines.model import Array
 
 _FLOOR = 1e-9
@@ -205,6 +205,7 @@ def _compared_at(
     faintest = min(max(physics.weakest / strength, _FLOOR), _HEARD)  # its own returns are heard
     _, held = _log_supports(evidence, centre, target)
     beams = beams_about(evidence, radius, strength, (physics.lost, faintest), held, n_most)
+    beams = beams._replace(plumb=(slope_of(centre, target.up), radius / distance))
     beams, priors = merged_within(beams, physics.gates, radius), _priors(radius, physics)
     if abs(beams.face.sum()) < 0.5 * len(beams.face) - 3:  # both faces of the scan show it
         moved = MOVED / radius

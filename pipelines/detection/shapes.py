@@ -37,10 +37,10 @@ X, Y, Z, NOISE, EDGE, ALONG, STRETCH, FORM, SHIFT, POLE, N_PARAMETERS = (
 )
 
 MEAN = 2.0 / 3.0  # of a radius: mean height of a sphere's surface over its disc
-_POLE_FROM, _POLE_DEPTH, _POLE_SHARE = 0.8, 0.4, 0.7  # of a pole, and of its beams that it stops
+_POLE_FROM, _POLE_SHARE = 0.8, 0.7  # radii below a centre that a pole begins; of its beams it stops
 _POLE_MOST = 0.9  # of the radius of what it holds: half the width of a pole
-_POST, _POST_DEPTH = 0.5, 0.1  # radii: least half width of a post, and scatter of its surface
-_UPRIGHT = 0.3  # of posts are round and upright; what else is as wide is anything
+_OFF_AXIS, _POLE_SCATTER = 0.1, 0.1  # radii: of upright poles, and of their surface about a line
+_POLE_DEPTH = 0.4  # radii off the axis: legs of tripods, and poles that lean
 _STRAY = 0.02  # share of the returns from a surface that lie anywhere: crosstalk, dust, strays
 _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between it and what is behind
 _MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behind it
@@ -104,6 +104,8 @@ def _unheard(share: float, hearing: _Hearing) -> float:
 
 _Form = tuple[float, float, float, float]
 _Beam = tuple[float, float, float]  # edge, and half the width across and up
+_Off = tuple[float, float, float]
+_Pole = tuple[float, float, float, float]  # where it is off its axis, with its variance; beams
 _Hearing = tuple[float, float]  # ``lost`` and ``faintest`` of ``Beams``
 
 
@@ -149,38 +151,40 @@ def _surface(
 
 
 @compiled
-def _on_pole(x: float, z: float, pole: float, beam: _Beam, sigma: float) -> tuple[float, float]:
-    """Return the share of a beam on a pole, and the density of a depth there."""
+def _share_on_pole(x: float, pole: float, beam: _Beam) -> float:
+    """Return the share of a beam that a pole stops, by half its width: a thin one covers a part."""
     edge, blur, _ = beam
-    share = _POLE_SHARE * pole / (pole + 0.5 * blur)  # a thin pole covers part of a beam
-    return share * _inside(pole - abs(x), blur, edge), _pole_density(x, z, pole, blur, sigma)
+    return float(_POLE_SHARE * pole / (pole + 0.5 * blur) * _inside(pole - abs(x), blur, edge))
 
 
 @compiled
-def _pole_density(x: float, z: float, pole: float, blur: float, sigma: float) -> float:
-    """Return the density of a depth about the axis of a pole, which may lean, or of a round post.
-
-    ``pole`` and ``blur`` are half the widths of the pole and of a beam, ``sigma`` the noise.
-    """
-    leaning = float(_normal(z, _POLE_DEPTH))
-    if pole < _POST:
-        return leaning
-    upright = _normal(z - _round(abs(x), pole, blur), sigma + _POST_DEPTH)
-    return float(_UPRIGHT * upright + (1.0 - _UPRIGHT) * leaning)
+def _ended(rest: float, share: float, z: float, h: _Hearing) -> float:
+    """Return the density of a beam without a return near, of which a pole would stop a share."""
+    return share * (_unheard(share, h) if z == np.inf else _MISPLACED) + (1.0 - share) * rest
 
 
 @compiled
-def _stopped(rest: float, on: tuple[float, float], z: float, wide: float, h: _Hearing) -> float:
-    """Return the density of a beam of which what holds an object up stops a share.
+def _stopped(
+    rest: float, share: float, off: _Off, pole: _Pole, passing: float
+) -> tuple[float, _Pole]:
+    """Return the density of a beam of which a pole stops a share, and the pole as known after it.
 
-    ``rest`` is the density of what becomes of the others, ``on`` the share and the density of the
-    depth where they stop; ``z`` is how deep the beam ends, ``wide`` as in ``Beams``.
+    ``rest`` is the density of what becomes of the others; ``off`` is how much deeper the beam ends
+    than the axis and the surface of an upright round pole, and the scatter of returns about that;
+    ``passing`` is the share of the beam that passes what the pole holds.
+    What earlier beams show of a pole is expected of the next: where it is off the axis of what it
+    holds by a constant (as by a Kalman filter), and how many of its returns are about there. The
+    product is the likelihood of all beams, and each depth is judged by those before it.
     """
-    share, density = on
-    if z >= NEAR:
-        density = _unheard(share, h) if z == np.inf else _MISPLACED
-    share *= 1.0 - wide
-    return float(share * density + (1.0 - share) * rest)
+    (axis, surface, noise), (mean, variance, n_on, n_off) = off, pole
+    straight = n_on / (n_on + n_off) * _normal(surface - mean, np.sqrt(variance + noise * noise))
+    on_pole = share * (straight + n_off / (n_on + n_off) * _normal(axis, _POLE_DEPTH))
+    density = on_pole + (1.0 - share) * rest
+    is_straight = passing * share * straight / (density + _FLOOR)
+    variance = 1.0 / (1.0 / variance + is_straight / (noise * noise))
+    mean += is_straight * variance / (noise * noise) * (surface - mean)
+    n_off += passing * on_pole / (density + _FLOOR) - is_straight
+    return density, (mean, variance, n_on + is_straight, n_off)
 
 
 @compiled
@@ -254,16 +258,22 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
     sigma = np.sqrt(variance)
     bottom = -form[1] if kind in (CYLINDER, POST) else -_POLE_FROM * form[0] * form[1]
     hearing, blurs = (beams.lost, beams.faintest), _half_widths(shape, beams)
+    known = (0.0, _OFF_AXIS * _OFF_AXIS, 1.0, 1.0)  # half of the poles are upright, or any share
     for i in range(len(beams.x)):
         x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
         y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
         moved = shape[Z] + beams.face[i] * shape[SHIFT + 2]
         z = beams.z[i] - moved
         rest, beam = beams.behind[i], _beam(shape, blurs, beams, i)
-        if pole > 0.0 and y < bottom:
-            held = _on_pole(x, z - MEAN, pole, beam, sigma)
-            rest = _stopped(rest, held, beams.z[i], beams.wide[i], hearing)
         share, depth, divided = _surface(kind, x, y, shape, form, beam)
+        if pole > 0.0 and y < bottom:
+            held = (1.0 - beams.wide[i]) * _share_on_pole(x, pole, beam)
+            if beams.z[i] >= NEAR:
+                rest = _ended(rest, held, beams.z[i], hearing)
+            elif held > 0.0:
+                axis = z - MEAN * form[0] - y * (beams.plumb[0] + y * beams.plumb[1])
+                off = (axis, axis - _round(abs(x), pole, blurs[0]), sigma + _POLE_SCATTER)
+                rest, known = _stopped(rest, held, off, known, 1.0 - share)
         on = 0.0
         if share > 0.0:
             on = _on_surface(kind, share, z - depth, sigma, beams.z[i], hearing)

@@ -13,6 +13,7 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.model import Array, Column
 
 _POLE = 0.5  # radii: half the width of a pole
+_TINY = 1e-3  # [m]
 ASIDE = 1.9
 """Radii: anything farther to a side may be another object."""
 
@@ -36,6 +37,12 @@ def is_beside_pole(across: float, along: float, blur: float) -> bool:
     """Return whether a beam passes a sphere below it and beside its pole; all in radii."""
     is_out = across * across + along * along > (1.2 + blur) ** 2
     return bool(is_out and along < -0.3 and _POLE + blur < abs(across) < ASIDE + blur)
+
+
+def slope_of(c: Array, up: Array) -> float:
+    """Return how steeply the line of sight to a place rises."""
+    rise = float(c @ up)
+    return rise / max(float(np.linalg.norm(c - rise * up)), _TINY)
 
 
 class View(NamedTuple):
