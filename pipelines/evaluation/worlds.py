@@ -64,15 +64,15 @@ N_FEW, N_LINES, HALF = 8, 2, 0.5
 """Returns and scan lines from which a marker should be found, and how much must be visible."""
 
 CLASSES = (
-    f"{N_MANY} returns or more, half visible",
+    f"on a pole, {N_MANY} returns or more",
     f"{N_FEW} to {N_MANY - 1} returns, half visible",
     f"{N_FEW} returns or more, on one scan line",
     "fewer returns, or mostly hidden",
     f"on the ground, {N_FEW} returns or more",
     f"on something wide, {N_MANY} returns or more",
 )
-"""Classes of markers by returns, visible share and what they stand on: the first is on poles. All
-but the third and the fourth lie on two scan lines or more and are half visible."""
+"""Classes of markers by returns, visible share and what they stand on. All but the third and the
+fourth lie on two scan lines or more and are half visible; the second stand on anything."""
 
 PROBABILITIES = (0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 0.9999, 1.0)
 """Edges of the classes of probability for which its calibration is shown."""
