@@ -65,8 +65,8 @@ class Beams(NamedTuple):
     lost, faintest : float
         Share of the pulses on a surface that are not heard, and of a beam that must be on it.
     plumb : float, float
-        How much deeper beams end on what is upright below the place: times how far up they pass,
-        and times its square.
+        Depth of an upright line through the place, by how far up it a beam passes: slope, and
+        factor of the square.
     """
 
     x: Array

@@ -74,7 +74,7 @@ _FORMS: dict[int, tuple[tuple[float, float], ...]] = {
 }
 ABUNDANCE = (208, 31, 274, 10, 33, 191, 18, 36, 36)
 """Groups of each hypothesis in 31 random worlds of the simulator, without those that something wide
-held up: the usual abundance of what stands free."""
+held up: the usual abundance of what stands free. Their markers stood on poles or on the ground."""
 
 ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
 """Groups of each hypothesis that something wide holds up, or the ground, in as many worlds."""

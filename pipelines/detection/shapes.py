@@ -104,8 +104,8 @@ def _unheard(share: float, hearing: _Hearing) -> float:
 
 _Form = tuple[float, float, float, float]
 _Beam = tuple[float, float, float]  # edge, and half the width across and up
-_Off = tuple[float, float, float]
-_Pole = tuple[float, float, float, float]  # where it is off its axis, with its variance; beams
+_Off = tuple[float, float, float]  # depth off the axis of a pole, off its surface; its scatter
+_Pole = tuple[float, float, float, float]  # depth off its place, variance; beams on it, and not
 _Hearing = tuple[float, float]  # ``lost`` and ``faintest`` of ``Beams``
 
 

@@ -9,7 +9,8 @@ from spheremark.pipelines.model import Array, Column, Index, Mask, Timed
 _N_SAMPLES = 10  # of the gimbal's angle, from which their scatter is known
 # times that scatter: changes of the slope at both samples, and at each; they scatter by 3 times it
 _CORNER, _NOISE = 12.0, 3.0
-_SLOW, _SLOWER = 0.25, 2.0  # share of samples at which one that goes by steps rests; their speed
+_SLOW = 0.25  # share of the samples, at least, at which a gimbal that goes by steps rests
+_SLOWER = 2.0  # times the greatest speed of as many: up to this it is slow
 _WITHIN, _NORMAL = 0.95, 1.96  # share of normal numbers within so many standard deviations
 
 

@@ -89,7 +89,7 @@ def draw_stand(
     """
     ground = float(terrain.height_at(lowest))
     is_wide, touches = rng.random() < _WIDE, rng.random() < _TOUCHING
-    rod = 0.0 if touches else _between(rng, _RODS)
+    rod = 0.0 if touches else between(rng, _RODS)
     height = float(lowest[2]) - ground
     if height < _LEAST:
         return Stand(GROUND, ground)
@@ -101,7 +101,7 @@ def draw_stand(
     return Stand(kind, float(top[2]) - stem, meshes, sticks)
 
 
-def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+def between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
     """Return a value between bounds, evenly in its logarithm."""
     return float(np.exp(rng.uniform(*np.log(bounds))))
 
@@ -109,7 +109,7 @@ def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
 def _plan(rng: np.random.Generator, body: _Body) -> tuple[Array, Array, float]:
     """Draw the middle of a rectangle below a body, its half sides [m], and its heading [rad]."""
     grown = max(1.0, body.radius / _ROOMY)
-    half = np.array([grown * _between(rng, _HALF_WIDTHS) for _ in range(2)])
+    half = np.array([grown * between(rng, _HALF_WIDTHS) for _ in range(2)])
     heading = float(rng.uniform(-np.pi, np.pi))
     off = np.append(half * rng.uniform(-_OFF, _OFF, 2), 0.0)
     return body.top + rot_z(heading) @ off, half, heading
@@ -125,7 +125,7 @@ def _crate(rng: np.random.Generator, body: _Body) -> _Surfaces:
 
 def _drum(rng: np.random.Generator, body: _Body) -> _Surfaces:
     """Return a thick post, a pipe or a drum."""
-    radius = min(body.radius * _between(rng, _DRUMS), max(_ROOMY, body.radius))
+    radius = min(body.radius * between(rng, _DRUMS), max(_ROOMY, body.radius))
     off = radius * rng.uniform(0.0, _OFF) * rot_z(rng.uniform(-np.pi, np.pi))[:, 0]
     high = body.top + off
     foot = np.append(high[:2], body.ground - _SUNK)

@@ -25,7 +25,7 @@ from spheremark.pipelines.simulation.options import Optics, Pick, Profile, Simul
 from spheremark.pipelines.simulation.rig import commensurability
 from spheremark.pipelines.simulation.rocks import draw_rocks, rock_mesh
 from spheremark.pipelines.simulation.scene import Mesh, Scene, terrain_mesh
-from spheremark.pipelines.simulation.stands import Stand, draw_stand
+from spheremark.pipelines.simulation.stands import Stand, between, draw_stand
 from spheremark.pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
 from spheremark.pipelines.simulation.terrain import Terrain, rough_terrain
 
@@ -55,7 +55,7 @@ class Prior(NamedTuple):
         """Return a value between the bounds, evenly or evenly in its logarithm."""
         low, high = self.bounds(family)
         if self.is_log:
-            return _between(rng, (low, high))
+            return between(rng, (low, high))
         return float(rng.uniform(low, high))
 
     def rms(self, family: str) -> float:
@@ -290,15 +290,10 @@ def _optics(rng: np.random.Generator, values: _Values, family: str) -> Optics:
         sigma_weak=values["sigma_weak"] * float(rng.random() < _WEAKER),
         range_scale=rng.normal(0.0, values["range_scale"]),
         range_bias=rng.normal(0.0, values["range_bias"]),
-        dust=_between(rng, _DUST) if family == "dust" else 0.0,
+        dust=between(rng, _DUST) if family == "dust" else 0.0,
         strays=_STRAYS if family in ("dust", _ALL) else 0.0,
         **{name: values[name] for name in ("roundness", "gate", "range_half", "softness")},
     )
-
-
-def _between(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
-    """Return a value between bounds, evenly in its logarithm."""
-    return float(np.exp(rng.uniform(*np.log(bounds))))
 
 
 def _motion(rng: np.random.Generator, values: _Values, family: str) -> dict[str, Any]:

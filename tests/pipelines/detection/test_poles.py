@@ -70,7 +70,7 @@ def test_a_pole_beside_its_axis_costs_less_than_its_beams_would_one_by_one(noise
 def test_the_order_of_the_beams_says_next_to_nothing(noise):
     rng, depths = np.random.default_rng(6), -HALF + noise
     logs = [log_of(beams_at(rng.permutation(depths))) for _ in range(20)]
-    assert np.ptp(logs) < 1.0, "of some forty that scattered depths would cost"
+    assert np.ptp(logs) < 1.0, "where scattered depths cost eighty"
 
 
 def test_what_is_upright_is_farther_away_the_lower_it_is_from_above():

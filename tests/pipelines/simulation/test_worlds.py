@@ -179,7 +179,7 @@ def test_three_in_ten_raised_markers_stand_on_something_wide_right_below_them():
     assert min(kinds[kind] for kind in wide) > 0.1 * n
 
 
-def test_what_a_marker_stands_on_hides_little_of_it_and_nothing_lies_in_it():
+def test_what_a_marker_stands_on_lies_below_it_and_nowhere_in_it():
     rng = np.random.default_rng(3)
     ground = rough_terrain(rng)
     for _ in range(60):
