@@ -7,7 +7,8 @@
 - ``ground`` separates the ground, ``seeds`` picks the places to examine,
 - ``features`` measures the shape of the returns about a place,
 - ``evidence`` gathers the beams towards and about a group, ``pulses`` those without a return,
-- ``faces`` are the two sides from which a turn sweeps each place,
+- ``faces`` are the two sides from which a turn sweeps each place, ``latency`` is how late the
+  angles of a gimbal are that goes by steps,
 - ``beams`` chooses those to compare, and describes what stands behind and beside,
 - ``support`` is what holds an object up,
 - ``shapes`` are what may stand there, ``search`` finds the likeliest of each kind by ``maxima`` of
@@ -65,6 +66,7 @@ from spheremark.pipelines.detection.hypotheses import (
     shown_by,
     usual_stones,
 )
+from spheremark.pipelines.detection.latency import late_by, on_time
 from spheremark.pipelines.detection.pulses import Hearing
 from spheremark.pipelines.detection.seeds import find_seeds
 from spheremark.pipelines.detection.shapes import (
@@ -139,15 +141,17 @@ def extract(
     upward and to a side is a seed: mean shift of a disc of the sphere's size, a robust fit along
     the beams; then the beams about it are compared under nine hypotheses. Ground is the opening of
     the lowest point per cell. Where no ground was seen, nothing is cut. Cost grows linearly with
-    the returns; it doubles where the two faces of the scan show the markers apart, for the search
-    is then done again with a mounting by which they agree.
+    the returns; it doubles where the two faces of the scan show the markers apart, or a gimbal that
+    goes by steps is late, for the search is then done again with a mounting and a clock by which
+    all agree.
     """
     if not cloud.intensities.any():  # not recorded: all things are as bright
         cloud = replace(cloud, intensities=np.ones_like(cloud.intensities))
     found, apart = _extracted(cloud, config, marker_radius)
-    if apart is None:
+    late = late_by(cloud, found.candidates, marker_radius)
+    if apart is None and not late:
         return found
-    again = joined(cloud, apart)
+    again = on_time(cloud if apart is None else joined(cloud, apart), late)
     found, _ = _extracted(again, config, marker_radius)
     return _moved_back(found, again.p_base, cloud.p_base)
 

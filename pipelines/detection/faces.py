@@ -17,7 +17,8 @@ from spheremark.pipelines.model import Array, Column, Rig, StitchedCloud
 TURNED, MOVED = 0.003, 0.01
 """Standard deviations of how far the faces lie apart with a rough mounting [rad], [m]."""
 
-_N_LEAST = 3  # spheres that both faces show
+_N_LEAST = 2  # spheres that both faces show
+_DIFFER = 0.25  # of these deviations: how far spheres of a scan differ in that, at least
 _CERTAIN = 5.0  # standard deviations of their median
 _ROUGH = 1.4826 * 1.2533  # of a median, over the median deviation and the root of the number
 
@@ -50,8 +51,9 @@ def apart_of(shifts: Array, distances: Array) -> Apart | None:
         return None
     values = np.column_stack([shifts[:, 1] / distances, shifts[:, 2]])
     found = np.median(values, axis=0)
-    sigmas = _ROUGH * np.median(np.abs(values - found), axis=0) / np.sqrt(len(values))
-    is_far = np.abs(found) > np.maximum(_CERTAIN * sigmas, [0.5 * TURNED, 0.5 * MOVED])
+    rough, scatters = np.array([TURNED, MOVED]), np.median(np.abs(values - found), axis=0)
+    sigmas = np.maximum(_ROUGH * scatters, _DIFFER * rough) / np.sqrt(len(values))
+    is_far = np.abs(found) > np.maximum(_CERTAIN * sigmas, 0.5 * rough)
     return Apart(*found.tolist()) if is_far.any() else None
 
 

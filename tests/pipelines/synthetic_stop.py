@@ -60,6 +60,13 @@ def turned(v, angles):
     return np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]])
 
 
+def moved_to(shots, angles):
+    """The same shots from a gimbal at other angles."""
+    by = angles - shots.angles
+    vectors = (turned(v, by) for v in (shots.origins, shots.directions, shots.across))
+    return Shots(*vectors, shots.rings, shots.times, (angles + np.pi) % (2 * np.pi) - np.pi)
+
+
 def towards(shots, p, reach):
     """The shots that pass a point by less than a distance."""
     away, off = np.linalg.norm(p), np.linalg.norm(shots.origins[0]) + 0.05
@@ -184,9 +191,11 @@ class World(NamedTuple):
     ground: float = -0.8
 
 
-def scan(world, rng, *, sigma=0.01, levelling=LEVEL, turn=13.2):
-    """One stop in a world, cast with one ray a shot."""
+def scan(world, rng, *, sigma=0.01, levelling=LEVEL, turn=13.2, angles_at=None):
+    """One stop in a world, cast with one ray a shot; the gimbal turns evenly, or by a function."""
     shots = fire(turn)
+    if angles_at is not None:
+        shots = moved_to(shots, angles_at(shots.times))
     R = levelling_rotation(levelling)
     origins, directions = shots.origins @ R.T, shots.directions @ R.T
     ranges = ground_ranges(origins, directions, world.ground)

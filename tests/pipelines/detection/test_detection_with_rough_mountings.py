@@ -104,4 +104,11 @@ def test_faces_that_agree_are_left():
     rng = np.random.default_rng(1)
     distances = np.geomspace(3.0, 20.0, 8)
     assert apart_of(rng.normal(0.0, 2e-3, (8, 3)), distances) is None
-    assert apart_of(np.full((2, 3), 0.1), distances[:2]) is None, "too few spheres"
+    assert apart_of(np.full((1, 3), 0.1), distances[:1]) is None, "too few spheres"
+
+
+def test_two_spheres_show_faces_far_apart_and_no_others():
+    distances = np.array([10.0, 15.0])
+    near, far = (np.outer(distances, [0.0, higher, 0.0]) for higher in (2e-3, 6e-3))
+    assert apart_of(near, distances) is None
+    assert apart_of(far, distances).higher == pytest.approx(6e-3)
