@@ -81,6 +81,7 @@ ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
 
 _HEIGHTS, _TALLER = 2.5, 1.0  # [m] up to which markers stand; and how much higher, if they do
 _ON_WIDE, _WIDE = 0.1, 0.4  # probability of standing on something wide, and how high that is [m]
+_ON_TALL = 0.02  # probability of lying on something wide that is as high as poles: vehicles, walls
 _LYING, _UNEVEN = 0.1, 0.2  # probability of lying on the ground; radii that it sinks in, or less
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
@@ -219,8 +220,9 @@ def _log_supports(evidence: Evidence, centre: Array, target: Target) -> tuple[Ar
     height, sigma, radius = evidence.height, evidence.sigma_height, target.radius
     standing = _standing_densities(height, sigma, radius)
     lying = _boulder_densities(height, sigma, radius)
-    held, perched = standing[1] / sum(standing), lying[1] / sum(lying)
-    return log_supports(evidence, float(centre @ target.up), radius, held, perched)
+    held = standing[1] / sum(standing), standing[2] / sum(standing)
+    level, perched = float(centre @ target.up), lying[1] / sum(lying)
+    return log_supports(evidence, level, radius, held, perched)
 
 
 def _priors(radius: float, physics: Physics) -> Array:
@@ -237,7 +239,7 @@ def _priors(radius: float, physics: Physics) -> Array:
     for kind, form in {**_FORMS, HEAD: head}.items():
         priors[kind, :, FORM : FORM + len(form)] = np.transpose(form)
     priors[:, 0, POLE] = _POLE_SIZE[0]
-    priors[[SPHERE, BALL, HEAD, CYLINDER, SOLID], 1, POLE] = _POLE_SIZE[1]
+    priors[[SPHERE, BALL, HEAD, CYLINDER, SOLID, PANEL], 1, POLE] = _POLE_SIZE[1]
     priors[BOULDER, :, NOISE] = physics.stones
     priors[HEAD, :, NOISE] = log(hypot(noise, _RELIEF)), _SIGMA_LOG_RELIEF
     priors[CLUTTER, 1, NOISE] = 0.0  # its own scatter is a parameter of form
@@ -269,20 +271,23 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
 
 def _standing_densities(
     height: float, sigma: float, radius: float, share: float = 1.0
-) -> tuple[float, float]:
+) -> tuple[float, float, float]:
     """Return the densities of the height of what a pole holds, and of what is held otherwise.
 
-    Something wide does, or the ground. Their sum is the density of both [1/m]. A ground that is
-    wrong shows nothing wide. A share of the poles is so high.
+    Something wide and low does, or the ground; or something tall. Their sum is the density of all
+    [1/m]. A ground that is wrong shows nothing wide. A share of what is tall is so high.
     """
-    held, unknown = _ON_WIDE + _LYING, 1.0 / _HEIGHTS
+    held, unknown = _ON_WIDE + _LYING + _ON_TALL, 1.0 / _HEIGHTS
     if not sigma < _HEIGHTS:
-        return (1.0 - held) * unknown, held * unknown
+        return (1.0 - held) * unknown, (held - _ON_TALL) * unknown, _ON_TALL * unknown
     above = erfc((radius - height) / (1.4142 * sigma))
     wide = _ON_WIDE * above * NormalDist(0.0, hypot(_WIDE, sigma)).pdf(height)
     wide += _LYING * NormalDist(radius, hypot(_UNEVEN * radius, sigma)).pdf(height)
-    on_pole = share * (1.0 - held) * 0.5 * unknown * above
-    return (1.0 - _NOT_GROUND) * on_pole + _NOT_GROUND * unknown, (1.0 - _NOT_GROUND) * wide
+    as_high = share * above * 0.5 * unknown
+    on_pole, wide, tall = (
+        (1.0 - _NOT_GROUND) * own for own in ((1.0 - held) * as_high, wide, _ON_TALL * as_high)
+    )
+    return on_pole + _NOT_GROUND * unknown, wide, tall
 
 
 def _share_as_high(height: float) -> float:

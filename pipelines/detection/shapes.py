@@ -244,6 +244,14 @@ def _merged(
 
 
 @compiled
+def _held_at(kind: int, form: _Form) -> tuple[float, float]:
+    """Return how high over its middle a pole holds an object, and how deep the axis lies there."""
+    if kind == PANEL:
+        return -form[1], 0.0
+    return -form[1] if kind == CYLINDER else -_POLE_FROM * form[0] * form[1], MEAN * form[0]
+
+
+@compiled
 def trust(beams: Beams) -> float:
     """Return the information of a beam among others, as a share of its information alone."""
     return 1.0 / (1.0 + len(beams.x) / _N_ALIKE)
@@ -256,7 +264,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
     pole = form[0] * min(np.exp(shape[POLE]), _POLE_MOST) if prior[1, POLE] > 0.0 else 0.0
     variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
     sigma = np.sqrt(variance)
-    bottom = -form[1] if kind in (CYLINDER, POST) else -_POLE_FROM * form[0] * form[1]
+    bottom, behind = _held_at(kind, form)
     hearing, blurs = (beams.lost, beams.faintest), _half_widths(shape, beams)
     known = (0.0, _OFF_AXIS * _OFF_AXIS, 1.0, 1.0)  # half of the poles are upright, or any share
     for i in range(len(beams.x)):
@@ -271,7 +279,7 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
             if beams.z[i] >= NEAR:
                 rest = _ended(rest, held, beams.z[i], hearing)
             elif held > 0.0:
-                axis = z - MEAN * form[0] - y * (beams.plumb[0] + y * beams.plumb[1])
+                axis = z - behind - y * (beams.plumb[0] + y * beams.plumb[1])
                 off = (axis, axis - _round(abs(x), pole, blurs[0]), sigma + _POLE_SCATTER)
                 rest, known = _stopped(rest, held, off, known, 1.0 - share)
         on = 0.0

@@ -29,17 +29,24 @@ _ROWS = np.array([0.0, *(0.2,) * 3, *(0.08,) * 5])
 begins there, or widens farther down, as a cone does or a tripod."""
 
 # Probabilities that nothing is below, that anything is, and that something is from each row down:
+# what is tall, as a vehicle or a wall, begins where the sphere ends, unlike those that widen;
 # shoulders begin within three radii below a head; a stone of two radii, round on top, is wider than
 # a pole's place 0.4 radii below a boulder, which is a quarter lower or higher than a sphere
 _ON_POLE = np.array([1.0 - _DOUBT, _DOUBT, *(0.0,) * 9])
 _ON_WIDE = np.array([0.001, _DOUBT, *((0.999 - _DOUBT) * _ROWS)])
+_ON_TALL = np.array([0.001, _DOUBT, 0.0, *((0.999 - _DOUBT) / 3.0,) * 3, *(0.0,) * 5])
+_WIDE = _ON_WIDE, _ON_TALL
 _ON_GROUND = np.array([0.005, 0.005, *(0.2475,) * 4, *(0.0,) * 5])
 _ON_ANOTHER = np.array([0.005, 0.005, 0.0, *(0.33,) * 3, *(0.0,) * 5])
 _SHOULDERS = np.array([0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0])
 
 
 def log_supports(
-    evidence: Evidence, level: float, radius: float, held: float, perched: float
+    evidence: Evidence,
+    level: float,
+    radius: float,
+    held: tuple[float, float],
+    perched: float,
 ) -> tuple[Array, Array]:
     """Return the log probabilities of the beams below a place by all hypotheses, (k,).
 
@@ -53,8 +60,9 @@ def log_supports(
         Height above the sensor [m].
     radius : float
         Of the sphere that is searched for [m].
-    held : float
-        Probability that what has this height is held by something wide, and not by a pole.
+    held : float, float
+        Probabilities that what has this height is held by something wide, and not by a pole: by
+        anything low, and by what is tall.
     perched : float
         Probability that a boulder of this height lies on another, and not on the ground.
 
@@ -67,17 +75,22 @@ def log_supports(
     return _log_supports(*_beams_below(evidence, level, radius), held, perched)
 
 
-def _log_supports(near: Array, past: Array, held: float, perched: float) -> tuple[Array, Array]:
+def _log_supports(
+    near: Array, past: Array, held: tuple[float, float], perched: float
+) -> tuple[Array, Array]:
     """Return the same, from beams to the left and to the right by rows, (2, 9)."""
-    pole, wide, shoulders = (
-        _log_supported(near, past, own, _NEIGHBOUR) for own in (_ON_POLE, _ON_WIDE, _SHOULDERS)
+    pole, wide, tall, shoulders = (
+        _log_supported(near, past, own, _NEIGHBOUR)
+        for own in (_ON_POLE, _ON_WIDE, _ON_TALL, _SHOULDERS)
     )
+    wide, by_tall = _either(wide, tall, held[1] / max(sum(held), _RAREST))
     ground, another = (_log_supported(near, past, own, 0.0) for own in (_ON_GROUND, _ON_ANOTHER))
-    stands, held = _either(pole, wide, held)
+    stands, by_wide = _either(pole, wide, sum(held))
     boulder, _ = _either(ground, another, perched)
     logs = np.full(len(NAMES), stands)
     logs[BOULDER], logs[HEAD] = boulder, shoulders
-    return logs, held * _shares_begun(near.sum(axis=0), past.sum(axis=0))
+    low, high = (_shares_begun(near.sum(axis=0), past.sum(axis=0), own) for own in _WIDE)
+    return logs, by_wide * ((1.0 - by_tall) * low + by_tall * high)
 
 
 def _either(first: float, second: float, share: float) -> tuple[float, float]:
@@ -149,9 +162,9 @@ def _log_support(near: Array, past: Array, support: Array) -> float:
 
 
 @compiled
-def _shares_begun(near: Array, past: Array) -> Array:
+def _shares_begun(near: Array, past: Array, support: Array) -> Array:
     """Return how probably something wide, if it holds a place, has begun at each row, (9,)."""
-    logs = _logs_of(near, past, _ON_WIDE)
+    logs = _logs_of(near, past, support)
     shares = np.exp(logs - logs.max())
     return np.asarray(np.cumsum(shares[2:]) / shares.sum())
 

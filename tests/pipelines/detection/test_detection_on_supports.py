@@ -32,7 +32,9 @@ def found_in(places, posts=()):
     return is_met[:, 5:].any(axis=0), int(np.sum(~is_met.any(axis=1)))
 
 
-@pytest.mark.parametrize(("distance", "height"), [(3.5, 0.5), (6.0, 0.5), (6.0, 0.8)])
+@pytest.mark.parametrize(
+    ("distance", "height"), [(3.5, 0.5), (6.0, 0.5), (6.0, 0.8), (6.0, 1.2), (8.0, 2.0)]
+)
 def test_markers_on_drums_are_found(distance, height):
     places = ring(distance, height + RADIUS, 0.5)
     drums = tuple(((x, y, GROUND), DRUM_RADIUS, height) for x, y, _ in places)

@@ -34,10 +34,11 @@ def test_an_unknown_height_tells_nothing():
     np.testing.assert_allclose(found, 1.0 / _HEIGHTS)
 
 
-def test_low_things_stand_on_something_wide_and_high_ones_on_poles():
+def test_low_things_stand_on_something_wide_and_most_high_ones_on_poles():
     low, high = (_standing_densities(height, SIGMA, RADIUS) for height in (0.3, 1.6))
     assert low[1] > 0.3 * low[0]
     assert high[1] < 0.001 * high[0]  # else heads on shoulders are markers on crates
+    assert high[2] == pytest.approx(0.02 / 0.78 * high[0], rel=0.1)  # vehicles and walls
 
 
 def test_a_boulder_higher_than_itself_lies_on_another():
@@ -54,7 +55,7 @@ def test_few_markers_are_as_high_as_lamps_and_crowns_of_trees():
             / _height_density(other, height, sigma, RADIUS)
             for height, sigma in ((2.0, SIGMA), (6.0, SIGMA), (30.0, SIGMA), (4.0, 2.0))
         )
-        wrong, poles = 0.02, 0.98 * 0.8
+        wrong, poles = 0.02, 0.98 * 0.8  # with what is wide and as high
         as_high = np.exp(-(6.0 - RADIUS - SIGMA - 2.5))
         assert high / low == pytest.approx((poles * as_high + wrong) / (poles + wrong), rel=0.01)
         assert highest / low == pytest.approx(wrong / (poles + wrong), rel=0.01)

@@ -15,8 +15,9 @@ from spheremark.pipelines.detection.support import (
 )
 
 N = 10  # beams in each row on each side
-ON_POLES, ON_WIDE = (0.05, 1.0), (0.6, 1.0)  # shares held, and perched: as high as poles, crates
-LOW = (0.6, 0.0)  # and as what lies on the ground
+# shares held by what is low and by what is tall, and perched: as high as poles, crates, and as what
+# lies on the ground
+ON_POLES, ON_WIDE, LOW = ((0.05, 0.0), 1.0), ((0.6, 0.0), 1.0), ((0.6, 0.0), 0.0)
 
 
 def logs(*near):
@@ -50,14 +51,27 @@ def test_what_stops_every_beam_from_some_row_on_is_a_head_or_a_boulder():
     assert np.argmax(ground) == BOULDER
 
 
+def test_what_is_tall_begins_where_a_sphere_ends_and_shoulders_below_a_neck():
+    wall, shoulders = [0, 0, *[N] * 7], [0, 0, 0, 0, 0, *[N] * 4]
+    pole_alone, as_high = ((0.0, 0.0), 1.0), ((0.0, 0.07), 1.0)
+    gained = [
+        logs_by(as_high, own)[SPHERE] - logs_by(pole_alone, own)[SPHERE]
+        for own in (wall, shoulders)
+    ]
+    assert gained[0] > 3.0
+    assert gained[1] < 0.1
+    as_head = logs_by(as_high, shoulders)
+    assert as_head[HEAD] > as_head[SPHERE] + 4.0
+
+
 def test_a_boulder_on_another_is_held_as_a_sphere_on_something_wide():
     """Its stone widens right below it; on legs, which begin farther down, no boulder stands."""
     stone, legs = [0, 0, 3, *[N] * 6], [0, 0, 0, 0, 0, 0, *[N] * 3]
-    perched, on_ground = (logs_by((0.99, share), stone) for share in (0.99, 0.01))
+    perched, on_ground = (logs_by(((0.99, 0.0), share), stone) for share in (0.99, 0.01))
     rarer = np.log(0.33 / (0.9 * 0.2))  # a crate begins in more rows, and may be anything
     assert perched[BOULDER] == pytest.approx(perched[SPHERE] + rarer, abs=0.1)
     assert perched[BOULDER] > on_ground[BOULDER]
-    on_legs = logs_by((0.99, 0.99), legs)
+    on_legs = logs_by(((0.99, 0.0), 0.99), legs)
     assert on_legs[SPHERE] > on_legs[BOULDER] + 5.0
 
 
@@ -88,7 +102,7 @@ def test_beams_below_show_whether_something_wide_holds_a_place():
     box, tripod, pole = np.zeros((3, 2, N_ROWS))
     box[:, 1:], tripod[:, 5:] = N, N
     on_box, on_tripod, on_pole = (
-        _log_supports(near, N - near, 0.01, 0.1)[1] for near in (box, tripod, pole)
+        _log_supports(near, N - near, (0.01, 0.0), 0.1)[1] for near in (box, tripod, pole)
     )
     assert (on_box[1:] > 0.99).all()
     assert (on_tripod[5:] > 0.99).all()
@@ -100,7 +114,7 @@ def test_without_beams_below_nothing_is_known():
     nothing, held = _log_supports(np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS)), *ON_POLES)
     np.testing.assert_allclose(nothing, 0.0, atol=1e-9)
     assert held[0] == 0.0
-    assert held[-1] == pytest.approx(0.899 * ON_POLES[0])  # or anything does, or nothing
+    assert held[-1] == pytest.approx(0.899 * ON_POLES[0][0])  # or anything does, or nothing
 
 
 def beams_below(level, counted=1):
