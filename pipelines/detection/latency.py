@@ -1,7 +1,7 @@
 """How late the angles of a gimbal are that goes by steps, by the spheres of a scan.
 
-Where it rests a sphere is in its place; from a turning one it is shown aside, by the speed. Hides
-the least squares, and how a scan is turned to what it would be on time.
+A resting gimbal shows a sphere in its place; a turning one shows it displaced by its speed times
+how late it is. Hides the least squares, and how a scan is corrected.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from spheremark.pipelines.model import Array, Column, MarkerCandidate, StitchedC
 
 _NS = 1e-9  # [s] in a nanosecond
 _SIGMA = 0.01  # [s] standard deviation of how late angles are, before anything is seen
-_N_ROUNDS, _FARTHEST = 10, 0.002  # of the least squares, and [s] that one goes
+_N_ROUNDS, _FARTHEST = 10, 0.002  # of the least squares, and the longest step of one [s]
 _WITHIN = 5e-4  # [s] before and after, between which the speed of the gimbal is taken
 _ROBUST, _LEAST_SCATTER = 2.5, 1e-4  # scatters from which a return counts less; least one [m]
-_HELD = 1e-3  # of the information on a centre: where it is across one line, no return shows
+_HELD = 1e-3  # share of the information that holds a centre where no return shows it
 _CERTAIN = 5.0  # standard deviations
 _FAST = 0.9  # share of the returns on a sphere that are slower than its fast ones
 _SEEN = 1e-3  # [rad] that the fast ones are turned by, at least: less is within a beam
