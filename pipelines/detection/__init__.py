@@ -169,7 +169,9 @@ def _extracted(
     noise = noise_of([one.features for one in compared if one.evidence.shows_below], target.radius)
     logs, shifts = _log_likelihoods(compared, noise, hearing, config, target)
     by_shape = np.exp(_posteriors(compared, logs, marker_radius)[:, SPHERE]).tolist()
-    log_ratios, by_paint = paint_of([one.evidence for one in compared], by_shape)
+    places = np.array([one.features.p_base for one in compared]).reshape(-1, 3)
+    evidence = [one.evidence for one in compared]
+    log_ratios, by_paint = paint_of(evidence, places, by_shape, marker_radius)
     logs[:, 0] += log_ratios
     judgements = [judgement_of(own, NAMES) for own in _posteriors(compared, logs, marker_radius)]
     is_sure = sure_ones([one.probability for one in judgements], config.false_rate)
@@ -198,7 +200,6 @@ def _extracted(
         ground_height_max=ground.height_max,
     )
     is_shown = np.array(is_sure, np.bool_) & shifts.any(axis=1)
-    places = np.array([one.features.p_base for one in compared]).reshape(-1, 3)
     distances = np.linalg.norm(places[is_shown], axis=1)
     return found, apart_of(marker_radius * shifts[is_shown], distances)
 

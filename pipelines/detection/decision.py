@@ -7,6 +7,7 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection.evidence import Evidence
@@ -27,6 +28,8 @@ _SHOWS_POLE, _NO_POLE = 0.9, 0.5  # markers that show poles; weight, at most, of
 _N_PAINTS = 1.0  # things that the usual spread of paints counts for in a scan
 _FINE = 0.25  # of the spread of markers: steps of the paint that is summed over
 _TAIL = 3.0  # degrees of freedom: of some markers the paint is dirty or in shade
+_THING = 2.0  # m: of one thing, at most, are groups no farther apart
+_BESIDE = 3.0  # radii: two groups that are nearer share returns
 _UNLIKE = -2.0  # logarithm of odds by paint from which a reason states it
 _FLAT = 0.236  # of the radius: standard deviation of the depths of a sphere about their mean
 _N_LARGE, _N_KNOWN = 30, 3  # returns that show the noise of a scan, and groups that agree
@@ -136,12 +139,15 @@ def reason_by_evidence(features: Features, evidence: Evidence, target: Target) -
     return ""
 
 
-def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tuple[Array, list[str]]:
+def paint_of(
+    groups: Sequence[Evidence], places: Array, probabilities: Sequence[float], radius: float
+) -> tuple[Array, list[str]]:
     """Return how much likelier the reflectivity of each group is if it is a marker.
 
     All markers have the same paint, other things have any. What it is, the other groups show: each
     is painted as markers are with its probability, or is anything. How unlike the paints of other
-    things are, they show too: where all look alike, paint says nothing. Some markers are dirty or
+    things are, they show too: where all look alike, paint says nothing. Neither does it where
+    groups near by are painted alike, for they may be parts of one thing. Some markers are dirty or
     in shade: but what nothing shows a pole of must be painted as they are, and says little of how
     where others show theirs.
 
@@ -149,8 +155,12 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
     ----------
     groups : sequence of Evidence
         Groups of a scan.
+    places : (n, 3)
+        Where they are [m].
     probabilities : sequence of float
         That each is a marker, by shape and surroundings.
+    radius : float
+        Of the markers [m].
 
     Returns
     -------
@@ -172,7 +182,8 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
     squares = (logs - paints) ** 2 / variances
     tails = (_TAIL + 1.0) * np.log1p(squares / _TAIL)  # of Student's distribution
     ratios = _log_density(np.where(has_pole, tails, squares), variances)
-    ratios -= _log_density((logs - middle) ** 2 / wide, wide)
+    alone = _log_density((logs - middle) ** 2 / wide, wide)
+    ratios -= _log_beside((logs, variances), alone, places, 1.0 - shares, radius)
     own = np.log1p(shares * np.expm1(ratios))
     known = own.sum(axis=0) - own - 0.5 * ((paints - middle) / _PAINTS) ** 2
     known -= np.logaddexp.reduce(known, axis=1, keepdims=True)
@@ -184,6 +195,26 @@ def paint_of(groups: Sequence[Evidence], probabilities: Sequence[float]) -> tupl
         for evidence, mean, ratio in zip(groups, means, found, strict=True)
     ]
     return found, texts
+
+
+def _log_beside(
+    paints: tuple[Array, Array], alone: Array, places: Array, weights: Array, radius: float
+) -> Array:
+    """Return the logarithms of densities of paint, (n, 1), if each may be a part of what is near.
+
+    It is a part of one of m things near by with a probability of m/(m + 1), as in Pólya's urn.
+    """
+    logs, variances = paints
+    pairs = KDTree(places).query_pairs(_THING, output_type="ndarray")
+    apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    i, j = pairs[apart > _BESIDE * radius].T
+    i, j = np.append(i, j), np.append(j, i)
+    both = variances[i] + variances[j]
+    like = np.exp(_log_density((logs[i] - logs[j]) ** 2 / both, both))
+    n = len(logs)
+    total = np.bincount(i, (weights[j] * like)[:, 0], n)[:, None]
+    n_near = np.bincount(i, weights[j, 0], n)[:, None]
+    return np.log(np.exp(alone) + total) - np.log1p(n_near)
 
 
 def _spread(off: Array, weights: Array) -> float:

@@ -227,7 +227,12 @@ def test_without_other_spheres_what_markers_share_is_the_usual():
 def painted(*reflectivities, n_past=150):
     """Ratios of a marker's paint to any paint, and sentences, of groups that may be markers."""
     groups = [evidence(brightness=value, n_past=n_past) for value in reflectivities]
-    return paint_of(groups, [0.9] * len(groups))
+    return paint_of(groups, along_a_line(len(groups)), [0.9] * len(groups), TARGET.radius)
+
+
+def along_a_line(n, step=10.0):
+    """Places [m] that are a step from one another."""
+    return np.outer(step * np.arange(n), [1.0, 0.0, 0.0])
 
 
 def test_what_is_painted_as_the_others_is_likelier_a_marker():
@@ -251,7 +256,8 @@ def test_many_doubtful_groups_do_not_outvote_a_few_sure_markers():
     n_sure, doubtful = 5, np.geomspace(7.0, 16.0, 40)
     values = [*n_sure * [21.0], *doubtful]
     groups = [evidence(brightness=value, n_past=0) for value in values]  # no pole is seen
-    ratios, _ = paint_of(groups, [0.9998] * n_sure + [0.3] * len(doubtful))
+    shares = [0.9998] * n_sure + [0.3] * len(doubtful)
+    ratios, _ = paint_of(groups, along_a_line(len(groups)), shares, TARGET.radius)
     assert min(ratios[:n_sure]) > 1.0 > max(ratios[n_sure:])
 
 
@@ -260,7 +266,8 @@ def test_what_shows_no_pole_does_not_outvote_markers_that_do():
     n_markers, n_stones = 5, 9
     groups = [evidence(brightness=30.0, n_past=150)] * n_markers
     groups += [evidence(brightness=9.0, n_past=0)] * n_stones
-    ratios, _ = paint_of(groups, [0.9998] * (n_markers + n_stones))
+    shares = [0.9998] * (n_markers + n_stones)
+    ratios, _ = paint_of(groups, along_a_line(len(groups)), shares, TARGET.radius)
     assert min(ratios[:n_markers]) > 1.0 > -8.0 > max(ratios[n_markers:])
 
 
@@ -279,11 +286,46 @@ def test_a_group_alone_shows_no_paint():
 def test_where_all_things_look_alike_paint_says_nothing(n_others):
     """As in clouds without intensities."""
     groups = [evidence()] * (8 + n_others)
-    ratios, _ = paint_of(groups, [0.99] * 8 + [0.1] * n_others)
+    shares = [0.99] * 8 + [0.1] * n_others
+    ratios, _ = paint_of(groups, along_a_line(len(groups)), shares, TARGET.radius)
     assert np.all(np.abs(ratios) < 1.0)
     groups[8:] = [evidence(brightness=value) for value in np.geomspace(20.0, 125.0, n_others)]
-    ratios, _ = paint_of(groups, [0.99] * 8 + [0.1] * n_others)
+    shares = [0.99] * 8 + [0.1] * n_others
+    ratios, _ = paint_of(groups, along_a_line(len(groups)), shares, TARGET.radius)
     assert np.all(ratios[:8] > 1.2)
+
+
+@pytest.mark.parametrize(("step", "is_fooled"), [(0.4, False), (10.0, True)])
+def test_parts_of_one_thing_do_not_testify_for_one_another(step, is_fooled):
+    """Five groups on the dark window of a car agree on a paint that nothing else has."""
+    n_markers, n_parts, others = 3, 5, np.geomspace(20.0, 125.0, 100)
+    values = [50.0] * n_markers + [3.0] * n_parts + list(others)
+    groups = [evidence(brightness=value) for value in values]
+    places = along_a_line(len(groups))
+    places[n_markers : n_markers + n_parts] = 100.0 + along_a_line(n_parts, step)
+    shares = [0.99] * n_markers + [0.1] * n_parts + [0.0] * len(others)
+    ratios, _ = paint_of(groups, places, shares, TARGET.radius)
+    assert (ratios[n_markers] > ratios[0]) == is_fooled
+
+
+@pytest.mark.parametrize("n_parts", [1, 3])
+def test_a_group_is_as_probably_a_part_of_each_thing_near_by_as_a_thing_of_its_own(n_parts):
+    """All have one paint: eight markers, one group, and parts of other things near by it or not."""
+    groups, shares = [evidence()] * (9 + n_parts), [0.99] * 8 + [0.5] + [0.0] * n_parts
+    near = along_a_line(9 + n_parts)
+    near[9:] = near[8] + np.outer(np.linspace(0.6, 1.5, n_parts), [0.0, 1.0, 0.0])
+    far, sharing = near.copy(), near.copy()
+    far[9:] += [0.0, 50.0, 0.0]
+    sharing[9:] = near[8] + [0.0, 0.0, 0.2]  # a radius or two away: of the same returns
+    by_near, by_far, by_sharing = (
+        paint_of(groups, places, shares, TARGET.radius)[0][8] for places in (near, far, sharing)
+    )
+    scale = np.hypot(0.1, 0.4 / np.sqrt(70))
+    alone = stats.norm(scale=np.hypot(scale, 0.7 / np.sqrt(1.58 + n_parts))).pdf(0.0)
+    of_parts = stats.norm(scale=np.sqrt(2.0) * scale).pdf(0.0)
+    other = (alone + n_parts * of_parts) / (1.0 + n_parts)
+    assert by_far - by_near == pytest.approx(np.log(other / alone), abs=1e-6)
+    assert by_sharing == pytest.approx(by_far)
 
 
 BEGUN = (-2.0, 0.5)  # what was expected of the scatter of stones when they were fitted
