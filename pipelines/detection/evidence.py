@@ -16,8 +16,9 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import Cells, rows_about
 from spheremark.pipelines.detection.faces import faces_of
 from spheremark.pipelines.detection.ground import Ground, planes_below
-from spheremark.pipelines.detection.pulses import Hearing, hearing_of, unheard_about
+from spheremark.pipelines.detection.pulses import REACH, Hearing, hearing_of, unheard_about
 from spheremark.pipelines.detection.target import (
+    BROAD,
     Target,
     blur_at,
     is_beside_pole,
@@ -25,7 +26,7 @@ from spheremark.pipelines.detection.target import (
     view_of,
 )
 from spheremark.pipelines.model import Array, Column, Rig, StitchedCloud
-from spheremark.pipelines.scan.firings import clock_of, heard_of
+from spheremark.pipelines.scan.firings import Clock, clock_of, heard_of
 from spheremark.pipelines.scan.interpolation import errors_of_interpolation
 from spheremark.pipelines.threads import side_by_side
 
@@ -40,6 +41,9 @@ _N_BELOW = 2  # beams below a place: as few show nothing of what it stands on
 _LIFTED = 2.0  # radii: the centre of what lies on the ground is not as high above it
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _ABOUT, _N_HIDDEN = 1.3, 5  # radii about a centre where a face shows nothing, of so many pulses
+_BODY, _BODY_REACH = 0.65, 0.3  # [m] from a head down to the middle of a body, and about that
+_TALL, _ASIDE, _DEEP = 0.25, (0.05, 0.12), 0.4  # [m] that beams on it pass that, and end from it
+_HEADS = (1.6, 0.6)  # [m] above the ground, where heads may be
 _TINY = 1e-6
 _UNKNOWN = Hearing(lost=1.0, weakest=0.0)
 
@@ -53,10 +57,14 @@ class Evidence(NamedTuple):
         Returns inside the limb at the depth of the sphere.
     n_before : int
         Returns inside the limb that lie before the sphere: beams that would have met it.
-    below : (2, 2, 9)
+    below : (2, 2, 2, 9)
         Beams below it and beside the pole: returns that are no deeper than it; returns behind it
-        and pulses without a return. To the left and to the right, by how far below, in ``ROW``
-        radii.
+        and pulses without a return. To the left and to the right; within ``BROAD`` radii and
+        farther; by how far below, in ``ROW`` radii.
+    lower : (2,)
+        Beams 0.4 to 0.9 m below it and 0.05 to 0.12 m beside, where a body would be below a head:
+        returns that are about as deep; returns behind and pulses without a return. Zero where no
+        head can be.
     brightness : float
         Reflectivity of the surface, 0-255: least squares over the beams of ``n_on``, weighted by
         their shares inside the limb.
@@ -85,6 +93,7 @@ class Evidence(NamedTuple):
     n_on: int
     n_before: int
     below: NDArray[np.int64]
+    lower: NDArray[np.int64]
     brightness: float
     n_distinct: int
     rows: NDArray[np.int32]
@@ -103,13 +112,13 @@ class Evidence(NamedTuple):
 
     @property
     def shows_below(self) -> bool:
-        """Whether most of all beams below it and beside the pole go past it."""
-        n_near, n_past = self.below.sum(axis=(1, 2))
+        """Whether most of all beams below it, beside the pole or where a body would be, go past."""
+        n_near, n_past = self.below.sum(axis=(1, 2, 3)) + self.lower
         return bool(n_past > _N_BELOW and n_past > n_near)
 
     def stands_free(self, radius: float) -> bool:
         """Return whether a ball of some radius [m] stands on nothing wide, as far as is seen."""
-        n_near, n_past = self.below.sum(axis=(1, 2))
+        n_near, n_past = self.below.sum(axis=(1, 2, 3)) + self.lower
         if n_near + n_past > _N_BELOW:
             return bool(n_past > n_near)
         return not self.height < _LIFTED * radius
@@ -140,13 +149,22 @@ def gather_evidence(
 
     def evidence_at(i: int) -> Evidence:
         rows = np.sort(rows_about(cloud.p_base, cells, centres[i], reach, np.inf))
-        straight, silent = rows, None
+        straight, silent, known = rows, None, clock
         if clock is not None:
             straight, bend_max = _straight(rows, bends, _PLACE * target.radius, centres[i])
             known = clock._replace(bend_max=bend_max)
-            silent = unheard_about(known, heard, centres[i], target)
+            silent = unheard_about(known, heard, centres[i], target.up, REACH * target.radius)
         found = _evidence_at(cloud, silent, straight, centres[i], target)
+        if abs(heights[i] - _HEADS[0]) < _HEADS[1] and target.radius < _BODY - _TALL:
+            found = found._replace(lower=lower_at(centres[i] - _BODY * target.up, known))
         return found._replace(height=float(heights[i]), sigma_height=float(planes[i, 4]))
+
+    def lower_at(c: Array, known: Clock | None) -> NDArray[np.int64]:
+        silent = np.empty((3, 0))
+        if known is not None:
+            silent = unheard_about(known, heard, c, target.up, _BODY_REACH)
+        points = cloud.p_base[rows_about(cloud.p_base, cells, c, _BODY_REACH, np.inf)]
+        return np.asarray(_count_lower(points, silent, c, target), np.int64)
 
     def gathered(first: int, end: int) -> list[Evidence]:
         return [evidence_at(i) for i in range(first, end)]
@@ -192,6 +210,7 @@ def _evidence_at(
         n_on=n_on,
         n_before=n_before,
         below=below,
+        lower=np.zeros(2, np.int64),
         brightness=brightness,
         n_distinct=n_distinct,
         rows=rows,
@@ -239,14 +258,15 @@ def _half_widths(rig: Rig, angles: Column, c: Array, target: Target) -> Array:
 
 @compiled
 def beside_pole(silent: Array, blur: float) -> NDArray[np.int64]:
-    """Return how many pulses without a return pass a sphere below it and beside its pole, (2, 9).
+    """Return how many pulses without a return pass a sphere below it and beside its pole.
 
-    To the left and to the right, by how far below.
+    To the left and to the right, within ``BROAD`` radii or farther, by how far below, (2, 2, 9).
     """
-    n = np.zeros((2, N_ROWS), np.int64)
+    n = np.zeros((2, 2, N_ROWS), np.int64)
     for i in range(silent.shape[1]):
-        if is_beside_pole(abs(silent[0, i]), silent[1, i], blur):
-            n[int(silent[0, i] > 0.0), _row(silent[1, i])] += 1
+        across, along = silent[0, i], silent[1, i]
+        if is_beside_pole(abs(across), along, blur):
+            n[int(across > 0.0), int(abs(across) > BROAD + blur), _row(along)] += 1
     return n
 
 
@@ -266,7 +286,7 @@ def _count_beams(
 ) -> tuple[int, int, NDArray[np.int64], float, int, Array]:
     """Return the counts of ``Evidence``, its brightness, and how the beams pass the centre.
 
-    Those below it end near or go past, to the left and to the right of it, by rows.
+    Those below it end near or go past, as ``Evidence`` counts them.
     """
     radius = target.radius
     blur = blur_at(c, target) / radius
@@ -276,7 +296,7 @@ def _count_beams(
         share, x, y = seen[2, i] / np.sqrt(np.sum(points[i] ** 2)), origins[0, i], origins[1, i]
         seen[0, i] += share * (view.across[0] * x + view.across[1] * y)
         seen[1, i] += share * (view.up[0] * x + view.up[1] * y)
-    n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((2, 2, N_ROWS), np.int64)
+    n_on, n_before, n_distinct, below = 0, 0, 0, np.zeros((2, 2, 2, N_ROWS), np.int64)
     light, lit = 0.0, 0.0
     half = int((1.0 + blur) / _PLACE) + 1
     is_met = np.zeros((2 * half, 2 * half), np.bool_)
@@ -296,8 +316,27 @@ def _count_beams(
         n_before += is_aimed and depth <= _ON[0]
         if is_beside_pole(across, along, blur):
             side, down = int(seen[0, i] > 0.0), _row(along)
-            below[int(depth > _BEHIND), side, down] += 1
+            below[int(depth > _BEHIND), side, int(across > BROAD + blur), down] += 1
     return n_on, n_before, below, light / max(lit, _TINY), n_distinct, seen
+
+
+@compiled
+def _count_lower(points: Column, silent: Array, c: Array, target: Target) -> NDArray[np.int64]:
+    """Return how many beams pass where a body would be about a place: ``Evidence.lower``."""
+    seen, blur = seen_from(points, view_of(c, target.up)), blur_at(c, target)
+    n = np.zeros(2, np.int64)
+    for i in range(len(points)):  # what is nearer hides it
+        if _is_on_body(seen[0, i], seen[1, i], blur) and seen[2, i] > -_DEEP:
+            n[int(seen[2, i] > _DEEP)] += 1
+    for i in range(silent.shape[1]):
+        n[1] += _is_on_body(silent[0, i], silent[1, i], blur)
+    return n
+
+
+@compiled
+def _is_on_body(across: float, up: float, blur: float) -> bool:
+    """Return whether a beam passes where a body would be, and farther aside than a pole; in m."""
+    return bool(abs(up) < _TALL and _ASIDE[0] + blur < abs(across) < _ASIDE[1] - 0.5 * blur)
 
 
 @compiled

@@ -80,9 +80,12 @@ ABUNDANCE_HELD = (29, 171, 432, 42, 107, 360, 185, 301, 873)
 """Groups of each hypothesis that something wide holds up, or the ground, in as many worlds."""
 
 _HEIGHTS, _TALLER = 2.5, 1.0  # [m] up to which markers stand; and how much higher, if they do
+_ON_NARROW = 0.1  # probability of standing on something but a pole that is narrow, as a tripod
 _ON_WIDE, _WIDE = 0.1, 0.4  # probability of standing on something wide, and how high that is [m]
 _ON_TALL = 0.02  # probability of lying on something wide that is as high as poles: vehicles, walls
 _LYING, _UNEVEN = 0.1, 0.2  # probability of lying on the ground; radii that it sinks in, or less
+_OTHERWISE = np.array([_ON_NARROW, _ON_WIDE + _LYING, _ON_TALL])
+_STANDING = np.array([1.0 - _OTHERWISE.sum(), *_OTHERWISE])
 _BOULDER_HEIGHT = (0.3, 0.6)  # radii: centre above the ground, and standard deviation
 _PERCHED, _STONE = 0.1, 0.5  # probability that a boulder lies on another, and mean height [m] of it
 _HEAD_HEIGHT, _LOWERED = (1.6, 0.12), 0.2  # [m] of adults who stand (1.70 m tall); share of others
@@ -219,10 +222,10 @@ def _log_supports(evidence: Evidence, centre: Array, target: Target) -> tuple[Ar
     """Return what ``log_supports`` does, by the height of a place."""
     height, sigma, radius = evidence.height, evidence.sigma_height, target.radius
     standing = _standing_densities(height, sigma, radius)
-    lying = _boulder_densities(height, sigma, radius)
-    held = standing[1] / sum(standing), standing[2] / sum(standing)
-    level, perched = float(centre @ target.up), lying[1] / sum(lying)
-    return log_supports(evidence, level, radius, held, perched)
+    on_ground, perched = _boulder_densities(height, sigma, radius)
+    lying = np.array([on_ground, 0.5 * perched, 0.5 * perched])
+    shares = standing / standing.sum(), lying / lying.sum()
+    return log_supports(evidence, float(centre @ target.up), radius, *shares)
 
 
 def _priors(radius: float, physics: Physics) -> Array:
@@ -256,7 +259,7 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     unknown = 1.0 / _HEIGHTS
     if kind in _STAND:
         share = _share_as_high(height - radius - sigma) if kind == SPHERE else 1.0
-        return sum(_standing_densities(height, sigma, radius, share))
+        return float(_standing_densities(height, sigma, radius, share).sum())
     if kind == BOULDER:
         return sum(_boulder_densities(height, sigma, radius))
     if not sigma < _HEIGHTS:
@@ -269,25 +272,23 @@ def _height_density(kind: int, height: float, sigma: float, radius: float) -> fl
     return _NOT_GROUND * unknown + (1.0 - _NOT_GROUND) * known
 
 
-def _standing_densities(
-    height: float, sigma: float, radius: float, share: float = 1.0
-) -> tuple[float, float, float]:
-    """Return the densities of the height of what a pole holds, and of what is held otherwise.
+def _standing_densities(height: float, sigma: float, radius: float, share: float = 1.0) -> Array:
+    """Return the densities of the height of what a pole holds, and of what is held otherwise, (4,).
 
-    Something wide and low does, or the ground; or something tall. Their sum is the density of all
-    [1/m]. A ground that is wrong shows nothing wide. A share of what is tall is so high.
+    By something narrow; by something wide and low, or the ground; by something tall. Their sum is
+    the density of all [1/m]. A ground that is wrong shows nothing wide. A share of what is not low
+    is so high.
     """
-    held, unknown = _ON_WIDE + _LYING + _ON_TALL, 1.0 / _HEIGHTS
+    unknown = 1.0 / _HEIGHTS
     if not sigma < _HEIGHTS:
-        return (1.0 - held) * unknown, (held - _ON_TALL) * unknown, _ON_TALL * unknown
+        return unknown * _STANDING
     above = erfc((radius - height) / (1.4142 * sigma))
-    wide = _ON_WIDE * above * NormalDist(0.0, hypot(_WIDE, sigma)).pdf(height)
-    wide += _LYING * NormalDist(radius, hypot(_UNEVEN * radius, sigma)).pdf(height)
-    as_high = share * above * 0.5 * unknown
-    on_pole, wide, tall = (
-        (1.0 - _NOT_GROUND) * own for own in ((1.0 - held) * as_high, wide, _ON_TALL * as_high)
-    )
-    return on_pole + _NOT_GROUND * unknown, wide, tall
+    found = 0.5 * unknown * share * above * _STANDING
+    found[2] = _ON_WIDE * above * NormalDist(0.0, hypot(_WIDE, sigma)).pdf(height)
+    found[2] += _LYING * NormalDist(radius, hypot(_UNEVEN * radius, sigma)).pdf(height)
+    found *= 1.0 - _NOT_GROUND
+    found[0] += _NOT_GROUND * unknown
+    return found
 
 
 def _share_as_high(height: float) -> float:

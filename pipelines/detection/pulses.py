@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spheremark.pipelines.detection.faces import faces_of
-from spheremark.pipelines.detection.target import Target, view_of
+from spheremark.pipelines.detection.target import view_of
 from spheremark.pipelines.model import Array, Index, StitchedCloud
 from spheremark.pipelines.scan.firings import Clock, in_base, numbers_of, pulses_about, pulses_of
 from spheremark.pipelines.scan.rigs import N_LASERS
@@ -21,15 +21,15 @@ _N_SECTORS, _N_IN_SECTOR = 24, 20  # of azimuth, and pulses that show one
 _WEAKEST = 0.01  # share of the returns that are taken for the weakest
 
 
-def unheard_about(clock: Clock, heard: Index, c: Array, target: Target) -> Array:
+def unheard_about(clock: Clock, heard: Index, c: Array, up: Array, reach: float) -> Array:
     """Return where pulses without a return pass a centre, across and up [m], and faces, (3, k).
 
     ``heard`` are the numbers of all others: what stands long before a place hides it.
     """
-    pulses, passing, _ = pulses_about(clock, c, REACH * target.radius)
+    pulses, passing, _ = pulses_about(clock, c, reach)
     rows = np.searchsorted(heard, pulses.numbers).clip(max=len(heard) - 1)
     found = heard[rows] != pulses.numbers
-    view, angles = view_of(c, target.up), pulses.angles[found]
+    view, angles = view_of(c, up), pulses.angles[found]
     p_base = in_base(clock.rig, passing[:, found], angles)
     return np.array([view.across @ p_base, view.up @ p_base, faces_of(clock.rig, angles, c)])
 

@@ -1,12 +1,14 @@
 """What holds an object up, by the beams that pass below it and beside a pole's place.
 
-A pole lets most of them pass, and the legs of a tripod do. Shoulders, a larger stone or the ground
-stop all from some height downwards.
+A pole lets most of them pass, and the legs of a tripod do, whose head is narrow. Shoulders, a
+larger stone or the ground stop all from some height downwards, and a body does farther down.
 """
 
 from __future__ import annotations
 
-from math import exp, lgamma, log
+from collections.abc import Sequence
+from math import lgamma, log
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,39 +20,71 @@ from spheremark.pipelines.detection.shapes import BOULDER, HEAD, NAMES
 from spheremark.pipelines.detection.target import ASIDE
 from spheremark.pipelines.model import Array
 
-# Beta distributions of the share of beams that end near, where nothing is, something, anything
+# Beta distributions of the share of beams that end near, where nothing is, something, anything,
+# the legs of a tripod, and the body below a head
 _OPEN, _CLOSED, _ANY = (0.3, 5.0), (5.0, 0.3), (0.5, 0.5)
+_LEGS, _BODY = (2.0, 4.0), (8.0, 1.0)
 
 _NEIGHBOUR = 0.05  # probability that something else is on one side; a boulder has ground on both
 _DOUBT = 0.1  # probability of anything below what stands on a pole or on something wide
 _RAREST = 1e-9  # nothing is less probable before a beam is seen
+_FACING = np.array([0.4, 0.35, 0.25])  # probabilities of these, see below, of a body
+_SPREADS, _SLOPES = 3, 2  # rows farther down from which legs may be aside, or shoulders are
 _ROWS = np.array([0.0, *(0.2,) * 3, *(0.08,) * 5])
 """Probabilities of the row from which something wide stops the beams below what stands on it: it
 begins there, or widens farther down, as a cone does or a tripod."""
 
-# Probabilities that nothing is below, that anything is, and that something is from each row down:
-# what is tall, as a vehicle or a wall, begins where the sphere ends, unlike those that widen;
-# shoulders begin within three radii below a head; a stone of two radii, round on top, is wider than
-# a pole's place 0.4 radii below a boulder, which is a quarter lower or higher than a sphere
+# Probabilities that nothing is below, that anything is, and that something is from each row down
 _ON_POLE = np.array([1.0 - _DOUBT, _DOUBT, *(0.0,) * 9])
 _ON_WIDE = np.array([0.001, _DOUBT, *((0.999 - _DOUBT) * _ROWS)])
 _ON_TALL = np.array([0.001, _DOUBT, 0.0, *((0.999 - _DOUBT) / 3.0,) * 3, *(0.0,) * 5])
-_WIDE = _ON_WIDE, _ON_TALL
 _ON_GROUND = np.array([0.005, 0.005, *(0.2475,) * 4, *(0.0,) * 5])
 _ON_ANOTHER = np.array([0.005, 0.005, 0.0, *(0.33,) * 3, *(0.0,) * 5])
-_SHOULDERS = np.array([0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0])
+_ON_BODY = np.array([0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0])
+
+
+_Beta = tuple[float, float]
+_Below = tuple[Array, Array, Array]  # near and past, (2, 2, 9), and as ``Evidence.lower``
+
+
+class _Support(NamedTuple):
+    """What may hold an object, by the beams below that end near.
+
+    Where it begins; how many rows farther down it may be broad, and the share of those farther to
+    the side that end there; and the share of those at the height of a body.
+    """
+
+    rows: Array
+    lag: int = 0
+    aside: _Beta = _CLOSED
+    lower: _Beta = _ANY
+
+
+# What is tall, as a vehicle or a wall, begins where the sphere ends, unlike those that widen
+_STANDING = (
+    _Support(_ON_POLE, lower=_OPEN),
+    _Support(_ON_WIDE, _SPREADS, _LEGS, _LEGS),
+    _Support(_ON_WIDE),
+    _Support(_ON_TALL),
+)
+# A stone of two radii, round on top, is wider than a pole's place 0.4 radii below a boulder, which
+# is a quarter lower or higher than a sphere; a smaller one is narrow there
+_LYING = (_Support(_ON_GROUND), _Support(_ON_ANOTHER), _Support(_ON_ANOTHER, _SPREADS, _ANY))
+# Shoulders begin within three radii below a head, or slope; from the side they are narrow
+_SHOULDERS = (
+    _Support(_ON_BODY, lower=_BODY),
+    _Support(_ON_BODY, _SLOPES, lower=_BODY),
+    _Support(_ON_BODY, _SPREADS, _LEGS, _BODY),
+)
 
 
 def log_supports(
-    evidence: Evidence,
-    level: float,
-    radius: float,
-    held: tuple[float, float],
-    perched: float,
+    evidence: Evidence, level: float, radius: float, standing: Array, lying: Array
 ) -> tuple[Array, Array]:
     """Return the log probabilities of the beams below a place by all hypotheses, (k,).
 
-    And how probably something wide holds it that has begun at each row, as those beams show, (9,).
+    And how probably something but a pole holds it that has begun at each row, as those beams show,
+    (9,).
 
     Parameters
     ----------
@@ -60,11 +94,12 @@ def log_supports(
         Height above the sensor [m].
     radius : float
         Of the sphere that is searched for [m].
-    held : float, float
-        Probabilities that what has this height is held by something wide, and not by a pole: by
-        anything low, and by what is tall.
-    perched : float
-        Probability that a boulder of this height lies on another, and not on the ground.
+    standing : (4,)
+        Probabilities that what has this height is held by a pole, by something as high that is
+        narrow, as a tripod, by something low and wide, and by something tall and wide.
+    lying : (3,)
+        Probabilities that a boulder of this height lies on the ground, on another that is wide, and
+        on one that is narrow.
 
     Notes
     -----
@@ -72,40 +107,37 @@ def log_supports(
     stops them is marginalised. Both sides show what holds it up, or one does and the other shows a
     neighbour; the ground is on both. What is neither a boulder nor a head is held as a sphere is.
     """
-    return _log_supports(*_beams_below(evidence, level, radius), held, perched)
+    beams = *_beams_below(evidence, level, radius), evidence.lower.astype(np.float64)
+    return _log_supports(beams, standing, lying)
 
 
-def _log_supports(
-    near: Array, past: Array, held: tuple[float, float], perched: float
-) -> tuple[Array, Array]:
-    """Return the same, from beams to the left and to the right by rows, (2, 9)."""
-    pole, wide, tall, shoulders = (
-        _log_supported(near, past, own, _NEIGHBOUR)
-        for own in (_ON_POLE, _ON_WIDE, _ON_TALL, _SHOULDERS)
-    )
-    wide, by_tall = _either(wide, tall, held[1] / max(sum(held), _RAREST))
-    ground, another = (_log_supported(near, past, own, 0.0) for own in (_ON_GROUND, _ON_ANOTHER))
-    stands, by_wide = _either(pole, wide, sum(held))
-    boulder, _ = _either(ground, another, perched)
+def _log_supports(beams: _Below, standing: Array, lying: Array) -> tuple[Array, Array]:
+    """Return the same, from how many beams below end near and go past."""
+    stands, held = _log_any(beams, _STANDING, standing, _NEIGHBOUR)
     logs = np.full(len(NAMES), stands)
-    logs[BOULDER], logs[HEAD] = boulder, shoulders
-    low, high = (_shares_begun(near.sum(axis=0), past.sum(axis=0), own) for own in _WIDE)
-    return logs, by_wide * ((1.0 - by_tall) * low + by_tall * high)
+    logs[BOULDER], _ = _log_any(beams, _LYING, lying, 0.0)
+    logs[HEAD], _ = _log_any(beams, _SHOULDERS, _FACING, _NEIGHBOUR)
+    return logs, held
 
 
-def _either(first: float, second: float, share: float) -> tuple[float, float]:
-    """Return the log probability by either of two causes, and how probably it is the second.
+def _log_any(
+    beams: _Below, supports: Sequence[_Support], shares: Array, neighbour: float
+) -> tuple[float, Array]:
+    """Return the log probability of all beams by any of some supports, of probabilities before.
 
-    From the log probabilities by each, and the share of the second before.
+    And how probably something has begun at each row, (9,).
     """
-    share = min(max(share, _RAREST), 1.0 - _RAREST)
-    first, second = first + log(1.0 - share), second + log(share)
-    total = float(np.logaddexp(first, second))
-    return total, exp(second - total)
+    near, past, lower = beams
+    logs = np.log(np.maximum(shares, _RAREST))
+    logs += [_log_share(*lower, own.lower) for own in supports]
+    logs += [_log_supported(near, past, *own[:3], neighbour) for own in supports]
+    total = float(np.logaddexp.reduce(logs))
+    begun = [_shares_begun(near, past, *own[:3]) for own in supports]
+    return total, np.asarray(np.exp(logs - total) @ begun)
 
 
 def _beams_below(evidence: Evidence, level: float, radius: float) -> tuple[Array, Array]:
-    """Return how many beams below a place end near, and how many are known to go past, (2, 9)."""
+    """Return how many beams below a place end near, and how many are known to go past."""
     near, past = evidence.below.astype(np.float64)
     n_past = past.sum()
     if evidence.silent is None:  # pulses are as dense below, and those without a return go past
@@ -114,7 +146,7 @@ def _beams_below(evidence: Evidence, level: float, radius: float) -> tuple[Array
 
 
 def _n_unknown(evidence: Evidence, level: float, radius: float) -> Array:
-    """Return how many pulses without a return below a place may have met unheard ground, (2, 9).
+    """Return how many pulses without a return below a place may have met unheard ground.
 
     The beams farther to the same side, past where a pole or shoulders would be, show how much of it
     is heard as far down. No ground is above the horizon, in the mean.
@@ -125,7 +157,7 @@ def _n_unknown(evidence: Evidence, level: float, radius: float) -> Array:
     n_heard, n_silent = (_n_aside(own, blur) for own in (evidence.seen[:2] / radius, silent))
     share = (n_silent.sum() + 0.5) / (n_heard.sum() + n_silent.sum() + 1.0)
     shares = (n_silent + share) / (n_heard + n_silent + 1.0)
-    return np.asarray(beside_pole(silent, blur) * shares)
+    return np.asarray(beside_pole(silent, blur) * shares[:, None])
 
 
 @compiled
@@ -140,52 +172,65 @@ def _n_aside(passing: Array, blur: float) -> Array:
 
 
 @compiled
-def _log_supported(near: Array, past: Array, support: Array, neighbour: float) -> float:
+def _log_supported(
+    near: Array, past: Array, rows: Array, lag: int, aside: _Beta, neighbour: float
+) -> float:
     """Return the log probability of all beams, by what holds a place up.
 
     ``neighbour`` is the probability that one side shows something else.
     """
-    found = _log_support(near[0] + near[1], past[0] + past[1], support) + log(1.0 - neighbour)
+    found = _log_support(near[0] + near[1], past[0] + past[1], rows, lag, aside)
+    found += log(1.0 - neighbour)
     for side in range(2):
         if neighbour > 0.0:
             other = _log_share(near[1 - side].sum(), past[1 - side].sum(), _ANY)
-            alone = _log_support(near[side], past[side], support) + log(0.5 * neighbour)
+            alone = _log_support(near[side], past[side], rows, lag, aside) + log(0.5 * neighbour)
             found = np.logaddexp(found, alone + other)
     return float(found)
 
 
 @compiled
-def _log_support(near: Array, past: Array, support: Array) -> float:
-    """Return the log probability of the beams of some rows, by what holds a place up."""
-    logs = _logs_of(near, past, support)
+def _log_support(near: Array, past: Array, rows: Array, lag: int, aside: _Beta) -> float:
+    """Return the log probability of beams, nearer and farther, by what holds a place up."""
+    logs = _logs_of(near, past, rows, lag, aside)
     return float(logs.max() + np.log(np.exp(logs - logs.max()).sum()))
 
 
 @compiled
-def _shares_begun(near: Array, past: Array, support: Array) -> Array:
-    """Return how probably something wide, if it holds a place, has begun at each row, (9,)."""
-    logs = _logs_of(near, past, support)
+def _shares_begun(near: Array, past: Array, rows: Array, lag: int, aside: _Beta) -> Array:
+    """Return how probably something, if it holds a place, has begun at each row, (9,)."""
+    logs = _logs_of(near[0] + near[1], past[0] + past[1], rows, lag, aside)
     shares = np.exp(logs - logs.max())
     return np.asarray(np.cumsum(shares[2:]) / shares.sum())
 
 
 @compiled
-def _logs_of(near: Array, past: Array, support: Array) -> Array:
-    """Return the log probabilities of the beams of some rows with each of a support, (2 + 9,)."""
-    n_near, n_past, over, passed = near.sum(), past.sum(), 0.0, 0.0
-    logs = np.full(len(support), -np.inf)
-    logs[0] = log(support[0]) + _log_share(n_near, n_past, _OPEN)
-    logs[1] = log(support[1]) + _log_share(n_near, n_past, _ANY)
-    for row in range(len(near)):
-        if support[2 + row] > 0.0:
-            begun = log(support[2 + row]) + _log_share(over, passed, _OPEN)
-            logs[2 + row] = begun + _log_share(n_near - over, n_past - passed, _CLOSED)
-        over, passed = over + near[row], passed + past[row]
+def _logs_of(near: Array, past: Array, rows: Array, lag: int, aside: _Beta) -> Array:
+    """Return the log probabilities of beams, nearer and farther, with each of a support, (2 + 9,).
+
+    Those nearer end there from its row on; those farther go past it until so many rows below.
+    """
+    if lag == 0:
+        stopped, gone = np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS))
+        stopped[0], gone[0] = near[0] + near[1], past[0] + past[1]
+    else:
+        stopped, gone = near, past
+    n_near, n_past, logs = stopped.sum(axis=1), gone.sum(axis=1), np.full(len(rows), -np.inf)
+    logs[0] = log(rows[0]) + _log_share(n_near.sum(), n_past.sum(), _OPEN)
+    logs[1] = log(rows[1]) + _log_share(n_near[0], n_past[0], _ANY)
+    logs[1] += _log_share(n_near[1], n_past[1], _OPEN)
+    for row in range(N_ROWS):
+        if rows[2 + row] > 0.0:
+            over, passed = stopped[0, :row].sum(), gone[0, :row].sum()
+            beside, wide = stopped[1, : row + lag].sum(), gone[1, : row + lag].sum()
+            begun = log(rows[2 + row]) + _log_share(over + beside, passed + wide, _OPEN)
+            begun += _log_share(n_near[0] - over, n_past[0] - passed, _CLOSED)
+            logs[2 + row] = begun + _log_share(n_near[1] - beside, n_past[1] - wide, aside)
     return logs
 
 
 @compiled
-def _log_share(n_near: float, n_past: float, beta: tuple[float, float]) -> float:
+def _log_share(n_near: float, n_past: float, beta: _Beta) -> float:
     """Return the log probability that so many beams end near, and so many go past."""
     a, b = beta
     begun = lgamma(a + b) - lgamma(a) - lgamma(b)

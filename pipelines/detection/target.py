@@ -14,8 +14,8 @@ from spheremark.pipelines.model import Array, Column
 
 _POLE = 0.5  # radii: half the width of a pole
 _TINY = 1e-3  # [m]
-ASIDE = 1.9
-"""Radii: anything farther to a side may be another object."""
+ASIDE, BROAD = 1.9, 1.3
+"""Radii: anything farther to a side may be another object; and the head of a tripod is narrower."""
 
 
 class Target(NamedTuple):

@@ -37,10 +37,11 @@ def features(n_points=70, **changes):
 
 def evidence(n_past=150, **changes):
     """A ball that stands on a pole before something far: half of the beams on each side."""
-    below = np.zeros((2, 2, N_ROWS), np.int64)
-    below[1, :, 4] = n_past // 2
+    below = np.zeros((2, 2, 2, N_ROWS), np.int64)
+    below[1, :, 0, 4] = n_past // 2
     seen = Evidence(
-        n_on=70, n_before=0, below=below, brightness=50.0, n_distinct=70,
+        n_on=70, n_before=0, below=below, lower=np.zeros(2, np.int64),
+        brightness=50.0, n_distinct=70,
         rows=np.empty(0, np.int32), seen=np.empty((3, 0)), faces=np.empty(0),
         strengths=np.empty(0), silent=None, widths=np.full((2, 2), 0.01), height=np.nan,
         sigma_height=np.inf,
@@ -66,15 +67,22 @@ def test_a_ball_seen_more_closely_than_any_other_shape_may_touch_something():
 def test_what_most_beams_below_go_past_shows_that_it_stands_on_a_pole():
     seen = evidence()
     assert seen.shows_below
-    seen.below[0, 0, 4] = 160
+    seen.below[0, 0, 0, 4] = 160
     assert not seen.shows_below
+
+
+def test_what_is_held_by_a_body_stands_on_no_pole_though_its_neck_is_thin():
+    seen = evidence(lower=np.array([160, 0]))
+    assert not seen.shows_below
+    assert not seen.stands_free(TARGET.radius)
+    assert evidence(lower=np.array([40, 80])).stands_free(TARGET.radius)  # legs of a tripod
 
 
 def test_what_stands_free_is_known_by_the_beams_below_or_else_by_its_height():
     seen, radius = evidence(), TARGET.radius
     assert seen._replace(height=0.5 * radius).stands_free(radius)
     held = evidence(n_past=0)
-    held.below[0, :, 4] = 2
+    held.below[0, :, 0, 4] = 2
     assert not held._replace(height=9.0 * radius).stands_free(radius)
     unseen = evidence(n_past=2)
     assert unseen.stands_free(radius)

@@ -8,7 +8,6 @@ import pytest
 from spheremark.pipelines.config import ExtractionConfig, StitchingConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.detection.pulses import unheard_about
-from spheremark.pipelines.detection.target import Target
 from spheremark.pipelines.geometry import inverse, transform
 from spheremark.pipelines.model import RING_UNKNOWN
 from spheremark.pipelines.scan.firings import clock_of, heard_of
@@ -30,9 +29,9 @@ def scan():
 def n_silent(scan, place):
     cloud, _, field = scan
     clock = clock_of(cloud)[0]
-    target = Target(field.marker_radius, np.array([0.0, 0.0, 1.0]), 0.003)
-    across, up, _ = unheard_about(clock, heard_of(cloud, clock), place, target)
-    return int(np.sum(np.hypot(across, up) < 0.8 * field.marker_radius))
+    upward, radius = np.array([0.0, 0.0, 1.0]), field.marker_radius
+    across, up, _ = unheard_about(clock, heard_of(cloud, clock), place, upward, 3.0 * radius)
+    return int(np.sum(np.hypot(across, up) < 0.8 * radius))
 
 
 def test_no_marker_is_refused_for_the_width_that_the_lines_show_and_nothing_else_is_found(scan):

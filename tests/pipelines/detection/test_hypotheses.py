@@ -36,9 +36,10 @@ def test_an_unknown_height_tells_nothing():
 
 def test_low_things_stand_on_something_wide_and_most_high_ones_on_poles():
     low, high = (_standing_densities(height, SIGMA, RADIUS) for height in (0.3, 1.6))
-    assert low[1] > 0.3 * low[0]
-    assert high[1] < 0.001 * high[0]  # else heads on shoulders are markers on crates
-    assert high[2] == pytest.approx(0.02 / 0.78 * high[0], rel=0.1)  # vehicles and walls
+    assert low[2] > 0.3 * low[0]
+    assert high[2] < 0.001 * high[0]  # else heads on shoulders are markers on crates
+    for density, share in ((high[1], 0.1), (high[3], 0.02)):  # tripods; vehicles and walls
+        assert density == pytest.approx(share / 0.68 * high[0], rel=0.1)
 
 
 def test_a_boulder_higher_than_itself_lies_on_another():
