@@ -43,6 +43,7 @@ _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _ABOUT, _N_HIDDEN = 1.3, 5  # radii about a centre where a face shows nothing, of so many pulses
 _BODY, _BODY_REACH = 0.65, 0.3  # [m] from a head down to the middle of a body, and about that
 _TALL, _ASIDE, _DEEP = 0.25, (0.05, 0.12), 0.4  # [m] that beams on it pass that, and end from it
+_AS_DENSE = 0.8  # of the pulses on a sphere: as many are there at least
 _HEADS = (1.6, 0.6)  # [m] above the ground, where heads may be
 _TINY = 1e-6
 _UNKNOWN = Hearing(lost=1.0, weakest=0.0)
@@ -147,29 +148,48 @@ def gather_evidence(
     if clock is not None and clock.bends.any():
         bends = errors_of_interpolation(cloud.gimbal_angles, np.arange(len(cloud.p_base)))
 
+    may_be_head = np.abs(heights - _HEADS[0]) < _HEADS[1]
+    may_be_head &= target.radius < _BODY - _TALL
+
+    def unheard_at(known: Clock | None, c: Array, reach: float) -> Array | None:
+        return None if known is None else unheard_about(known, heard, c, target.up, reach)
+
     def evidence_at(i: int) -> Evidence:
         rows = np.sort(rows_about(cloud.p_base, cells, centres[i], reach, np.inf))
-        straight, silent, known = rows, None, clock
+        straight, known = rows, clock
         if clock is not None:
             straight, bend_max = _straight(rows, bends, _PLACE * target.radius, centres[i])
             known = clock._replace(bend_max=bend_max)
-            silent = unheard_about(known, heard, centres[i], target.up, REACH * target.radius)
+        silent = unheard_at(known, centres[i], REACH * target.radius)
         found = _evidence_at(cloud, silent, straight, centres[i], target)
-        if abs(heights[i] - _HEADS[0]) < _HEADS[1] and target.radius < _BODY - _TALL:
-            found = found._replace(lower=lower_at(centres[i] - _BODY * target.up, known))
+        if may_be_head[i]:
+            c = centres[i] - _BODY * target.up
+            points = cloud.p_base[rows_about(cloud.p_base, cells, c, _BODY_REACH, np.inf)]
+            lower = _lower_at(points, unheard_at(known, c, _BODY_REACH), c, target, found.n_on)
+            found = found._replace(lower=lower)
         return found._replace(height=float(heights[i]), sigma_height=float(planes[i, 4]))
-
-    def lower_at(c: Array, known: Clock | None) -> NDArray[np.int64]:
-        silent = np.empty((3, 0))
-        if known is not None:
-            silent = unheard_about(known, heard, c, target.up, _BODY_REACH)
-        points = cloud.p_base[rows_about(cloud.p_base, cells, c, _BODY_REACH, np.inf)]
-        return np.asarray(_count_lower(points, silent, c, target), np.int64)
 
     def gathered(first: int, end: int) -> list[Evidence]:
         return [evidence_at(i) for i in range(first, end)]
 
     return list(chain(*side_by_side(gathered, len(centres), threaded_from=4))), hearing
+
+
+def _lower_at(
+    points: Column, silent: Array | None, c: Array, target: Target, n_on: int
+) -> NDArray[np.int64]:
+    """Return ``Evidence.lower`` at the middle of a body.
+
+    Where nothing shows the pulses without a return, pulses are nearly as dense there as on the
+    sphere.
+    """
+    n = np.asarray(_count_lower(points, np.empty((3, 0)) if silent is None else silent, c, target))
+    if silent is None:
+        blur = blur_at(c, target)
+        wide = max(_ASIDE[1] - _ASIDE[0] - 1.5 * blur, 0.0)
+        area = 4.0 * _TALL * wide / (np.pi * (target.radius + blur) ** 2)
+        n[1] += max(int(_AS_DENSE * area * n_on) - n.sum(), 0)
+    return n
 
 
 def _straight(

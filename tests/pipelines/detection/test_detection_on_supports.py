@@ -1,4 +1,6 @@
-"""Markers on the ground, on drums and on posts: what is below them stops beams."""
+"""Markers on the ground, on drums, posts and tripods: what is below them stops beams."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,6 +8,7 @@ import pytest
 from spheremark.pipelines.config import ExtractionConfig
 from spheremark.pipelines.detection import extract
 from spheremark.pipelines.detection.beams import _behind
+from spheremark.pipelines.model import RING_UNKNOWN
 from tests.pipelines.synthetic_stop import RADIUS, World, ring_of_markers, scan
 
 GROUND, N = -0.8, 6
@@ -19,13 +22,16 @@ def ring(distance, height, turn):
     return np.column_stack([level, np.full(N, GROUND + height)])
 
 
-def found_in(places, posts=()):
+def found_in(places, posts=(), has_rings=True):
     """Whether each place has a marker, and how many markers lie elsewhere, among some on poles."""
     on_poles = ring_of_markers(n=5)
     world = World(
         balls=tuple((tuple(p), RADIUS) for p in (*on_poles, *places)), posts=posts, ground=GROUND
     )
-    found = extract(scan(world, np.random.default_rng(8)), ExtractionConfig(), RADIUS)
+    cloud = scan(world, np.random.default_rng(8))
+    if not has_rings:  # nothing shows which pulses had no return
+        cloud = replace(cloud, rings=np.full_like(cloud.rings, RING_UNKNOWN))
+    found = extract(cloud, ExtractionConfig(), RADIUS)
     rough = np.array([one.p_base_rough for one in found.candidates])
     gaps = np.linalg.norm(rough[:, None] - np.vstack([on_poles, places]), axis=2)
     is_met = gaps < 0.5 * RADIUS
@@ -48,6 +54,22 @@ def test_markers_on_posts_nearly_as_wide_are_found(distance, share):
     places, height = ring(distance, 1.0, 0.5), 1.0 - RADIUS
     posts = tuple(((x, y, GROUND), share * RADIUS, height) for x, y, _ in places)
     is_found, n_others = found_in(places, posts)
+    assert is_found.all()
+    assert n_others == 0
+
+
+@pytest.mark.parametrize(("distance", "has_rings"), [(9.0, True), (5.0, False), (9.0, False)])
+def test_markers_on_tripods_as_high_as_people_are_found(distance, has_rings):
+    """Before the sky: the head of a tripod begins where shoulders would, but no body is below."""
+    places = ring(distance, 1.6, 0.5)
+    heads = tuple(((x, y, z - RADIUS - 0.19), 0.08, 0.1) for x, y, z in places)
+    rods = tuple(((x, y, z - RADIUS - 0.1), 0.01, 0.1) for x, y, z in places)
+    legs = tuple(
+        ((x + a, y + b, GROUND), 0.02, z - GROUND - RADIUS - 0.19)
+        for x, y, z in places
+        for a, b in ((0.0, 0.0), (0.2, 0.0), (0.0, -0.2))
+    )
+    is_found, n_others = found_in(places, (*heads, *rods, *legs), has_rings)
     assert is_found.all()
     assert n_others == 0
 
