@@ -42,7 +42,11 @@ _LIFTED = 2.0  # radii: the centre of what lies on the ground is not as high abo
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _ABOUT, _N_HIDDEN = 1.3, 5  # radii about a centre where a face shows nothing, of so many pulses
 _BODY, _BODY_REACH = 0.65, 0.3  # [m] from a head down to the middle of a body, and about that
-_TALL, _ASIDE, _DEEP = 0.25, (0.05, 0.12), 0.4  # [m] that beams on it pass that, and end from it
+_HALF_BODY, _BESIDE, _DEEP = (
+    0.25,
+    (0.05, 0.12),
+    0.4,
+)  # [m] that beams on it pass that, and end from it
 _AS_DENSE = 0.8  # of the pulses on a sphere: as many are there at least
 _HEADS = (1.6, 0.6)  # [m] above the ground, where heads may be
 _TINY = 1e-6
@@ -149,7 +153,7 @@ def gather_evidence(
         bends = errors_of_interpolation(cloud.gimbal_angles, np.arange(len(cloud.p_base)))
 
     may_be_head = np.abs(heights - _HEADS[0]) < _HEADS[1]
-    may_be_head &= target.radius < _BODY - _TALL
+    may_be_head &= target.radius < _BODY - _HALF_BODY
 
     def unheard_at(known: Clock | None, c: Array, reach: float) -> Array | None:
         return None if known is None else unheard_about(known, heard, c, target.up, reach)
@@ -186,8 +190,8 @@ def _lower_at(
     n = np.asarray(_count_lower(points, np.empty((3, 0)) if silent is None else silent, c, target))
     if silent is None:
         blur = blur_at(c, target)
-        wide = max(_ASIDE[1] - _ASIDE[0] - 1.5 * blur, 0.0)
-        area = 4.0 * _TALL * wide / (np.pi * (target.radius + blur) ** 2)
+        wide = max(_BESIDE[1] - _BESIDE[0] - 1.5 * blur, 0.0)
+        area = 4.0 * _HALF_BODY * wide / (np.pi * (target.radius + blur) ** 2)
         n[1] += max(int(_AS_DENSE * area * n_on) - n.sum(), 0)
     return n
 
@@ -356,7 +360,7 @@ def _count_lower(points: Column, silent: Array, c: Array, target: Target) -> NDA
 @compiled
 def _is_on_body(across: float, up: float, blur: float) -> bool:
     """Return whether a beam passes where a body would be, and farther aside than a pole; in m."""
-    return bool(abs(up) < _TALL and _ASIDE[0] + blur < abs(across) < _ASIDE[1] - 0.5 * blur)
+    return bool(abs(up) < _HALF_BODY and _BESIDE[0] + blur < abs(across) < _BESIDE[1] - 0.5 * blur)
 
 
 @compiled

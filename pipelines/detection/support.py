@@ -28,8 +28,8 @@ _LEGS, _BODY = (2.0, 4.0), (8.0, 1.0)
 _NEIGHBOUR = 0.05  # probability that something else is on one side; a boulder has ground on both
 _DOUBT = 0.1  # probability of anything below what stands on a pole or on something wide
 _RAREST = 1e-9  # nothing is less probable before a beam is seen
-_FACING = np.array([0.4, 0.35, 0.25])  # probabilities of these, see below, of a body
-_SPREADS, _SLOPES = 3, 2  # rows farther down from which legs may be aside, or shoulders are
+_SPREADS, _SLOPES = 3, 2  # rows that legs begin to spread below a head, and shoulders slope over
+_FACING = np.array([0.4, 0.35, 0.25])  # probabilities of each of ``_SHOULDERS``
 _ROWS = np.array([0.0, *(0.2,) * 3, *(0.08,) * 5])
 """Probabilities of the row from which something wide stops the beams below what stands on it: it
 begins there, or widens farther down, as a cone does or a tripod."""
@@ -41,7 +41,6 @@ _ON_TALL = np.array([0.001, _DOUBT, 0.0, *((0.999 - _DOUBT) / 3.0,) * 3, *(0.0,)
 _ON_GROUND = np.array([0.005, 0.005, *(0.2475,) * 4, *(0.0,) * 5])
 _ON_ANOTHER = np.array([0.005, 0.005, 0.0, *(0.33,) * 3, *(0.0,) * 5])
 _ON_BODY = np.array([0.001, 0.001, 0.0, 0.0, *(0.1996,) * 5, 0.0, 0.0])
-
 
 _Beta = tuple[float, float]
 _Below = tuple[Array, Array, Array]  # near and past, (2, 2, 9), and as ``Evidence.lower``
@@ -56,7 +55,7 @@ class _Support(NamedTuple):
 
     rows: Array
     lag: int = 0
-    aside: _Beta = _CLOSED
+    farther: _Beta = _CLOSED
     lower: _Beta = _ANY
 
 
@@ -130,9 +129,9 @@ def _log_any(
     near, past, lower = beams
     logs = np.log(np.maximum(shares, _RAREST))
     logs += [_log_share(*lower, own.lower) for own in supports]
-    logs += [_log_supported(near, past, *own[:3], neighbour) for own in supports]
+    logs += [_log_supported(near, past, own, neighbour) for own in supports]
     total = float(np.logaddexp.reduce(logs))
-    begun = [_shares_begun(near, past, *own[:3]) for own in supports]
+    begun = [_shares_begun(near, past, own) for own in supports]
     return total, np.asarray(np.exp(logs - total) @ begun)
 
 
@@ -172,49 +171,46 @@ def _n_aside(passing: Array, blur: float) -> Array:
 
 
 @compiled
-def _log_supported(
-    near: Array, past: Array, rows: Array, lag: int, aside: _Beta, neighbour: float
-) -> float:
+def _log_supported(near: Array, past: Array, support: _Support, neighbour: float) -> float:
     """Return the log probability of all beams, by what holds a place up.
 
     ``neighbour`` is the probability that one side shows something else.
     """
-    found = _log_support(near[0] + near[1], past[0] + past[1], rows, lag, aside)
-    found += log(1.0 - neighbour)
+    found = _log_support(near[0] + near[1], past[0] + past[1], support) + log(1.0 - neighbour)
     for side in range(2):
         if neighbour > 0.0:
             other = _log_share(near[1 - side].sum(), past[1 - side].sum(), _ANY)
-            alone = _log_support(near[side], past[side], rows, lag, aside) + log(0.5 * neighbour)
+            alone = _log_support(near[side], past[side], support) + log(0.5 * neighbour)
             found = np.logaddexp(found, alone + other)
     return float(found)
 
 
 @compiled
-def _log_support(near: Array, past: Array, rows: Array, lag: int, aside: _Beta) -> float:
+def _log_support(near: Array, past: Array, support: _Support) -> float:
     """Return the log probability of beams, nearer and farther, by what holds a place up."""
-    logs = _logs_of(near, past, rows, lag, aside)
+    logs = _logs_of(near, past, support)
     return float(logs.max() + np.log(np.exp(logs - logs.max()).sum()))
 
 
 @compiled
-def _shares_begun(near: Array, past: Array, rows: Array, lag: int, aside: _Beta) -> Array:
+def _shares_begun(near: Array, past: Array, support: _Support) -> Array:
     """Return how probably something, if it holds a place, has begun at each row, (9,)."""
-    logs = _logs_of(near[0] + near[1], past[0] + past[1], rows, lag, aside)
+    logs = _logs_of(near[0] + near[1], past[0] + past[1], support)
     shares = np.exp(logs - logs.max())
     return np.asarray(np.cumsum(shares[2:]) / shares.sum())
 
 
 @compiled
-def _logs_of(near: Array, past: Array, rows: Array, lag: int, aside: _Beta) -> Array:
+def _logs_of(near: Array, past: Array, support: _Support) -> Array:
     """Return the log probabilities of beams, nearer and farther, with each of a support, (2 + 9,).
 
     Those nearer end there from its row on; those farther go past it until so many rows below.
     """
-    if lag == 0:
-        stopped, gone = np.zeros((2, N_ROWS)), np.zeros((2, N_ROWS))
+    rows, lag = support.rows, support.lag
+    stopped, gone = near.copy(), past.copy()
+    if lag == 0:  # those farther to the side do as those nearer
         stopped[0], gone[0] = near[0] + near[1], past[0] + past[1]
-    else:
-        stopped, gone = near, past
+        stopped[1], gone[1] = 0.0, 0.0
     n_near, n_past, logs = stopped.sum(axis=1), gone.sum(axis=1), np.full(len(rows), -np.inf)
     logs[0] = log(rows[0]) + _log_share(n_near.sum(), n_past.sum(), _OPEN)
     logs[1] = log(rows[1]) + _log_share(n_near[0], n_past[0], _ANY)
@@ -225,7 +221,9 @@ def _logs_of(near: Array, past: Array, rows: Array, lag: int, aside: _Beta) -> A
             beside, wide = stopped[1, : row + lag].sum(), gone[1, : row + lag].sum()
             begun = log(rows[2 + row]) + _log_share(over + beside, passed + wide, _OPEN)
             begun += _log_share(n_near[0] - over, n_past[0] - passed, _CLOSED)
-            logs[2 + row] = begun + _log_share(n_near[1] - beside, n_past[1] - wide, aside)
+            logs[2 + row] = begun + _log_share(
+                n_near[1] - beside, n_past[1] - wide, support.farther
+            )
     return logs
 
 
