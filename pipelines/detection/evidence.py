@@ -16,9 +16,10 @@ from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.cells import Cells, rows_about
 from spheremark.pipelines.detection.faces import faces_of
 from spheremark.pipelines.detection.ground import Ground, planes_below
-from spheremark.pipelines.detection.pulses import REACH, Hearing, hearing_of, unheard_about
+from spheremark.pipelines.detection.pulses import Hearing, hearing_of, unheard_about
 from spheremark.pipelines.detection.target import (
     BROAD,
+    REACH,
     Target,
     blur_at,
     is_beside_pole,

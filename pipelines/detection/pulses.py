@@ -12,9 +12,6 @@ from spheremark.pipelines.model import Array, Index, StitchedCloud
 from spheremark.pipelines.scan.firings import Clock, in_base, numbers_of, pulses_about, pulses_of
 from spheremark.pipelines.scan.rigs import N_LASERS
 
-REACH = 3.0
-"""Radii about a place within which its pulses without a return are known."""
-
 _N_SAMPLES, _N_SAMPLE = 300, 100  # samples of so many returns that follow each other
 _GROUND = (0.25, 0.55)  # sines of the angles below the horizon where the ground is near
 _N_SECTORS, _N_IN_SECTOR = 24, 20  # of azimuth, and pulses that show one

@@ -15,15 +15,14 @@ import numpy as np
 from spheremark.pipelines.compilation import compiled
 from spheremark.pipelines.detection.beams import BELOW
 from spheremark.pipelines.detection.evidence import N_ROWS, ROW, Evidence, beside_pole
-from spheremark.pipelines.detection.pulses import REACH
 from spheremark.pipelines.detection.shapes import BOULDER, HEAD, NAMES
-from spheremark.pipelines.detection.target import ASIDE
+from spheremark.pipelines.detection.target import ASIDE, REACH
 from spheremark.pipelines.model import Array
 
 # Beta distributions of the share of beams that end near, where nothing is, something, anything,
 # the legs of a tripod, and the body below a head
 _OPEN, _CLOSED, _ANY = (0.3, 5.0), (5.0, 0.3), (0.5, 0.5)
-_LEGS, _BODY = (2.0, 4.0), (8.0, 1.0)
+_LEGS, _BODY = (3.0, 7.0), (8.0, 1.0)
 
 _NEIGHBOUR = 0.05  # probability that something else is on one side; a boulder has ground on both
 _DOUBT = 0.1  # probability of anything below what stands on a pole or on something wide
@@ -49,31 +48,37 @@ _Below = tuple[Array, Array, Array]  # near and past, (2, 2, 9), and as ``Eviden
 class _Support(NamedTuple):
     """What may hold an object, by the beams below that end near.
 
-    Where it begins; how many rows farther down it may be broad, and the share of those farther to
-    the side that end there; and the share of those at the height of a body.
+    Where it begins, and the share of beams that end there; how many rows farther down it may be
+    broad, and the share of those farther to the side; and the share at the height of a body.
     """
 
     rows: Array
+    share: _Beta = _CLOSED
     lag: int = 0
     farther: _Beta = _CLOSED
     lower: _Beta = _ANY
 
 
-# What is tall, as a vehicle or a wall, begins where the sphere ends, unlike those that widen
+# The head of a tripod may be as narrow as a pole or nearly as wide as a sphere. What is tall, as a
+# vehicle or a wall, begins where the sphere ends, unlike those that widen
 _STANDING = (
     _Support(_ON_POLE, lower=_OPEN),
-    _Support(_ON_WIDE, _SPREADS, _LEGS, _LEGS),
+    _Support(_ON_WIDE, _ANY, _SPREADS, _LEGS, _LEGS),
     _Support(_ON_WIDE),
-    _Support(_ON_TALL),
+    _Support(_ON_TALL, lower=_CLOSED),
 )
 # A stone of two radii, round on top, is wider than a pole's place 0.4 radii below a boulder, which
 # is a quarter lower or higher than a sphere; a smaller one is narrow there
-_LYING = (_Support(_ON_GROUND), _Support(_ON_ANOTHER), _Support(_ON_ANOTHER, _SPREADS, _ANY))
-# Shoulders begin within three radii below a head, or slope; from the side they are narrow
+_LYING = (
+    _Support(_ON_GROUND),
+    _Support(_ON_ANOTHER),
+    _Support(_ON_ANOTHER, _CLOSED, _SPREADS, _ANY),
+)
+# Shoulders begin within three radii below a head, or slope; from the side, they are as narrow
 _SHOULDERS = (
     _Support(_ON_BODY, lower=_BODY),
-    _Support(_ON_BODY, _SLOPES, lower=_BODY),
-    _Support(_ON_BODY, _SPREADS, _LEGS, _BODY),
+    _Support(_ON_BODY, lag=_SLOPES, lower=_BODY),
+    _Support(_ON_BODY, _ANY, _SPREADS, _LEGS, _BODY),
 )
 
 
@@ -220,7 +225,7 @@ def _logs_of(near: Array, past: Array, support: _Support) -> Array:
             over, passed = stopped[0, :row].sum(), gone[0, :row].sum()
             beside, wide = stopped[1, : row + lag].sum(), gone[1, : row + lag].sum()
             begun = log(rows[2 + row]) + _log_share(over + beside, passed + wide, _OPEN)
-            begun += _log_share(n_near[0] - over, n_past[0] - passed, _CLOSED)
+            begun += _log_share(n_near[0] - over, n_past[0] - passed, support.share)
             logs[2 + row] = begun + _log_share(
                 n_near[1] - beside, n_past[1] - wide, support.farther
             )

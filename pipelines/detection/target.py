@@ -17,6 +17,9 @@ _TINY = 1e-3  # [m]
 ASIDE, BROAD = 1.9, 1.3
 """Radii: anything farther to a side may be another object; and the head of a tripod is narrower."""
 
+REACH = 3.0
+"""Radii about a place within which its pulses without a return are known."""
+
 
 class Target(NamedTuple):
     """The sphere that is searched for: radius [m], upward unit vector, beam divergence [rad]."""
@@ -34,8 +37,12 @@ def blur_at(c: Array, target: Target) -> float:
 
 @compiled
 def is_beside_pole(across: float, along: float, blur: float) -> bool:
-    """Return whether a beam passes a sphere below it and beside its pole; all in radii."""
-    is_out = across * across + along * along > (1.2 + blur) ** 2
+    """Return whether a beam passes a sphere below it and beside its pole; all in radii.
+
+    And so near that its pulses without a return are known.
+    """
+    gap2 = across * across + along * along
+    is_out = (1.2 + blur) ** 2 < gap2 < REACH * REACH
     return bool(is_out and along < -0.3 and _POLE + blur < abs(across) < ASIDE + blur)
 
 

@@ -58,7 +58,8 @@ def test_markers_on_posts_nearly_as_wide_are_found(distance, share):
     assert n_others == 0
 
 
-@pytest.mark.parametrize(("distance", "has_rings"), [(9.0, True), (5.0, False), (9.0, False)])
+@pytest.mark.parametrize("has_rings", [True, False])
+@pytest.mark.parametrize("distance", [5.0, 9.0])
 def test_markers_on_tripods_as_high_as_people_are_found(distance, has_rings):
     """Before the sky: the head of a tripod begins where shoulders would, but no body is below."""
     places = ring(distance, 1.6, 0.5)
@@ -71,6 +72,16 @@ def test_markers_on_tripods_as_high_as_people_are_found(distance, has_rings):
     )
     is_found, n_others = found_in(places, (*heads, *rods, *legs), has_rings)
     assert is_found.all()
+    assert n_others == 0
+
+
+@pytest.mark.parametrize("has_rings", [True, False])
+def test_heads_that_are_spheres_are_none_on_bodies(has_rings):
+    """Helmets as large as markers: a body below them stops beams that pass the legs of a tripod."""
+    heads = ring(9.0, 1.6, 0.5)
+    bodies = tuple(((x, y, GROUND), 0.2, z - GROUND - 0.22) for x, y, z in heads)
+    is_found, n_others = found_in(heads, bodies, has_rings)
+    assert not is_found.any()
     assert n_others == 0
 
 

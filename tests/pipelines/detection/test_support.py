@@ -56,12 +56,12 @@ def test_what_stops_every_beam_from_some_row_on_is_a_head_or_a_boulder():
     assert np.argmax(logs(wide_from(0), **on_ground)) == BOULDER
 
 
-def test_where_a_body_would_be_it_stops_all_beams_and_legs_a_third():
+def test_where_a_body_would_be_it_stops_all_beams_and_legs_a_few():
     above, aside = wide_from(5), [0] * N_ROWS  # both are narrow right below
     as_seen = logs(above, aside)
     for n_near, n_past, is_body in ((30, 1, True), (12, 24, False), (0, 36, False)):
         found = logs(above, aside, lower=(n_near, n_past)) - as_seen
-        expected = betabinom.logpmf(n_near, n_near + n_past, [2.0, 8.0], [4.0, 1.0])
+        expected = betabinom.logpmf(n_near, n_near + n_past, [3.0, 8.0], [7.0, 1.0])
         assert found[SPHERE] - found[HEAD] == pytest.approx(expected[0] - expected[1], abs=0.1)
         assert (found[HEAD] > found[SPHERE] + 3.0) == is_body
 
