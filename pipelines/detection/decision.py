@@ -149,7 +149,7 @@ def paint_of(
     things are, they show too: where all look alike, paint says nothing. Neither does it where
     groups near by are painted alike, for they may be parts of one thing. Some markers are dirty or
     in shade: but what nothing shows a pole of must be painted as they are, and says little of how
-    where others show theirs.
+    where others show theirs. Without a return on it a group shows no paint.
 
     Parameters
     ----------
@@ -167,10 +167,25 @@ def paint_of(
     (n,), list of str
         Logarithms of the ratios; and where one is much against a marker, that as a sentence.
     """
-    if not groups:
-        return np.empty(0), []
+    ratios, texts = np.zeros(len(groups)), [""] * len(groups)
+    seen = [i for i, evidence in enumerate(groups) if evidence.n_on > 0]
+    if not seen:
+        return ratios, texts
+    shown = [groups[i] for i in seen]
+    ratios[seen], means = _log_ratios(shown, places[seen], np.asarray(probabilities)[seen], radius)
+    for i, mean in zip(seen, means, strict=True):
+        if ratios[i] < _UNLIKE:
+            own, usual = groups[i].brightness, np.exp(mean)
+            texts[i] = f" Its reflectivity is {own:.0f}, that of the markers {usual:.0f}."
+    return ratios, texts
+
+
+def _log_ratios(
+    groups: Sequence[Evidence], places: Array, probabilities: Array, radius: float
+) -> tuple[Array, Array]:
+    """Return what ``paint_of`` does, of groups with returns; and logarithms of markers' paint."""
     logs = np.log([max(evidence.brightness, 1.0) for evidence in groups])[:, None]
-    n_distinct = np.array([max(evidence.n_distinct, 1) for evidence in groups])[:, None]
+    n_distinct = np.array([evidence.n_distinct for evidence in groups])[:, None]
     has_pole = np.array([evidence.shows_below for evidence in groups])[:, None]
     variances, middle = _PAINT**2 + _SHADE**2 / n_distinct, float(np.median(logs))
     shares = np.minimum(probabilities, 1.0 - 1.0 / _MOST)[:, None]
@@ -187,14 +202,7 @@ def paint_of(
     own = np.log1p(shares * np.expm1(ratios))
     known = own.sum(axis=0) - own - 0.5 * ((paints - middle) / _PAINTS) ** 2
     known -= np.logaddexp.reduce(known, axis=1, keepdims=True)
-    found, means = np.logaddexp.reduce(known + ratios, axis=1), np.exp(known) @ paints
-    texts = [
-        f" Its reflectivity is {evidence.brightness:.0f}, that of the markers {np.exp(mean):.0f}."
-        if ratio < _UNLIKE
-        else ""
-        for evidence, mean, ratio in zip(groups, means, found, strict=True)
-    ]
-    return found, texts
+    return np.logaddexp.reduce(known + ratios, axis=1), np.exp(known) @ paints
 
 
 def _log_beside(

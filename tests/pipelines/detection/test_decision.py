@@ -259,6 +259,20 @@ def test_dirt_may_hide_the_paint_of_a_marker_whose_pole_is_seen_only():
     assert unseen < -8.0
 
 
+def test_what_no_return_shows_the_paint_of_is_judged_by_its_shape_alone():
+    values = [50.0] * 5 + list(np.geomspace(20.0, 60.0, 20))
+    seen = [evidence(brightness=value) for value in values]
+    shares = [0.99] * 5 + [0.01] * 20
+    unseen = [evidence(n_on=0, n_distinct=0, brightness=0.0)] * 3
+    alone, _ = paint_of(seen, along_a_line(25), shares, TARGET.radius)
+    ratios, texts = paint_of(
+        [*unseen, *seen], along_a_line(28) - 30.0, [0.5] * 3 + shares, TARGET.radius
+    )
+    np.testing.assert_array_equal(ratios[:3], 0.0)
+    np.testing.assert_allclose(ratios[3:], alone)
+    assert texts[:3] == [""] * 3
+
+
 def test_many_doubtful_groups_do_not_outvote_a_few_sure_markers():
     """As among far stones, each of which may be a marker."""
     n_sure, doubtful = 5, np.geomspace(7.0, 16.0, 40)
