@@ -34,7 +34,7 @@ from spheremark.pipelines.threads import side_by_side
 ROW, N_ROWS = 0.45, 9
 """Height in radii of a row of beams below a sphere, and number of rows."""
 
-_REACH = 4.0  # radii about a centre: shoulders lie within three radii below a head
+_REACH = 4.0  # radii about a centre: what is beside an object, and what holds it
 _BEHIND = 1.0  # radii of depth from which a return lies behind the object
 _ON = (-1.3, 0.3)  # radii of depth within which a return may lie on the sphere
 _PLACE = 0.1  # radii: beams nearer to each other than this pass at the same place
@@ -43,11 +43,8 @@ _LIFTED = 2.0  # radii: the centre of what lies on the ground is not as high abo
 _MEAN_WIDTH = 0.75  # of the greater half width of a beam: in any direction
 _ABOUT, _N_HIDDEN = 1.3, 5  # radii about a centre where a face shows nothing, of so many pulses
 _BODY, _BODY_REACH = 0.65, 0.3  # [m] from a head down to the middle of a body, and about that
-_HALF_BODY, _BESIDE, _DEEP = (
-    0.25,
-    (0.05, 0.12),
-    0.4,
-)  # [m] that beams on it pass that, and end from it
+_HALF_BODY, _DEEP = 0.25, 0.4  # [m] from that up and down, and in depth: beams on it end there
+_BESIDE = (0.05, 0.12)  # [m] to a side of that: beams there pass a pole, and are on a body
 _AS_DENSE = 0.8  # of the pulses on a sphere: as many are there at least
 _HEADS = (1.6, 0.6)  # [m] above the ground, where heads may be
 _TINY = 1e-6
@@ -360,7 +357,7 @@ def _count_lower(points: Column, silent: Array, c: Array, target: Target) -> NDA
 
 @compiled
 def _is_on_body(across: float, up: float, blur: float) -> bool:
-    """Return whether a beam passes where a body would be, and farther aside than a pole; in m."""
+    """Return whether a beam passes where a body would be, and not where a pole would; in m."""
     return bool(abs(up) < _HALF_BODY and _BESIDE[0] + blur < abs(across) < _BESIDE[1] - 0.5 * blur)
 
 

@@ -31,7 +31,8 @@ _SPREADS, _SLOPES = 3, 2  # rows that legs begin to spread below a head, and sho
 _FACING = np.array([0.4, 0.35, 0.25])  # probabilities of each of ``_SHOULDERS``
 _ROWS = np.array([0.0, *(0.2,) * 3, *(0.08,) * 5])
 """Probabilities of the row from which something wide stops the beams below what stands on it: it
-begins there, or widens farther down, as a cone does or a tripod."""
+begins there, or widens farther down, as a cone does or a tripod. The last two rows are farther down
+than pulses without a return are known: what begins there is not seen."""
 
 # Probabilities that nothing is below, that anything is, and that something is from each row down
 _ON_POLE = np.array([1.0 - _DOUBT, _DOUBT, *(0.0,) * 9])
