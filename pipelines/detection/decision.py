@@ -37,7 +37,7 @@ _FEW_OFF = 0.05  # share of these that may lie beside such a group
 _N_LEAST, _N_MOST = 6.0, 2500.0  # returns of the farthest and of the nearest markers
 _SCATTERED = 0.5  # share of other objects that lie anywhere, and not where markers are put
 _N_PRIOR = 5.0  # places that the usual abundance of a hypothesis counts for in a scan
-_VARIES = (0.13, 0.15, 0.15, 0.1, 0.04, 0.02)  # of what markers share, between those of one scan
+_VARIES = (0.13, 0.15, 0.15, 0.1, 0.2, 0.04, 0.02)  # of what markers share, within a scan
 _WINDOWS = (0.5, 1.0)  # of a VLP-16's width at its window, out or in: the first echo or the last
 _N_OF_STONE = 6.0  # parameters of a stone's ellipsoid that returns show
 _LEAST_INFORMATION = 1e-6  # of a group that shows nothing: next to none, but it can be inverted
@@ -265,7 +265,7 @@ def shared_of(
 
     Parameters
     ----------
-    shown : (n, 6), (n, 6, 6)
+    shown : (n, 7), (n, 7, 7)
         What each shows as a sphere, as in ``Physics``, and the covariances.
     probabilities : sequence of float
         That each is a marker: by as much it counts.
@@ -276,7 +276,7 @@ def shared_of(
 
     Returns
     -------
-    (n, 6), (n, 6)
+    (n, 7), (n, 7)
         Means, and standard deviations that contain how far markers of a scan differ.
 
     Notes
@@ -378,7 +378,7 @@ def gates_of(by_gate: Array, probabilities: Sequence[float]) -> Array:
 
 
 def _by_windows(half_widths: Array) -> Array:
-    """Return what each group shows by what all share and by two widths at the window, (n, 6, 8)."""
+    """Return what each group shows by what all share and by two widths at the window, (n, 7, 9)."""
     n = len(_VARIES)
     by = np.zeros((len(half_widths), n, n + 2))
     by[:, :, :n] = np.eye(n)

@@ -97,12 +97,13 @@ class Physics(NamedTuple):
 
     Attributes
     ----------
-    shared, sigmas : (6,)
+    shared, sigmas : (7,)
         What its markers have in common, and how far that may be off: the logarithm of the noise of
         ranges [m]; half widths of a beam outside an outline where half the beams hit, before
         nothing that is heard, and, beyond where both are as strong, before something; and the
         logarithms of how much wider beams are along the spin axis than their data sheet says, of
-        how far depths are stretched and of how far the radius is another.
+        their scatter about their stated directions [half widths], of how far depths are stretched
+        and of how far the radius is another.
     lost : float
         Share of the pulses on a surface without a return.
     weakest : float
@@ -122,12 +123,14 @@ class Physics(NamedTuple):
     gates: Array = np.eye(1, len(GATES))[0]
 
 
-USUAL = (1.0, -0.1, 0.0, 0.0, 0.0)  # edges: measured on markers of random worlds
+USUAL = (1.0, -0.1, 0.0, log(0.15), 0.0, 0.0)  # edges: measured on markers of random worlds
 """What markers share in a scan that nothing is known of, as in ``Physics``, but for the noise."""
 
-SIGMAS = (0.35, 0.6, 0.35, 0.1, 0.02)
+SIGMAS = (0.35, 0.6, 0.35, 0.7, 0.1, 0.02)
 """How far these may be off: what an echo is moves the limb, and the limb against the middle. A beam
-that is twice as wide one way by its data sheet may be round. Radii are known to 2 % in common."""
+that is twice as wide one way by its data sheet may be round. What steps and jitter of the angles
+scatter beams by, 0.2 mrad of a VLP-16, is known to a factor of two. Radii are known to 2 % in
+common."""
 
 
 def log_likelihoods(
@@ -186,12 +189,13 @@ def shown_by(
 
     Returns
     -------
-    (6,), (6, 6), (9,)
+    (7,), (7, 7), (9,)
         What markers share, as in ``Physics``, and its covariance; the logarithms of the likelihoods
         of the sphere by each of ``GATES``.
     """
     beams, priors = _compared_at(evidence, centre, target, physics, _N_BEAMS[0])
-    shared, cov = shared_by(sphere, priors[SPHERE], physics.sigmas[ALONG - NOISE], beams)
+    of_beams = physics.sigmas[ALONG - NOISE : STRETCH - NOISE]
+    shared, cov = shared_by(sphere, priors[SPHERE], of_beams, beams)
     shared[0] += np.log(target.radius)
     by_gate, densities = np.empty(len(GATES)), np.empty(len(beams.x))
     for i, gate in enumerate(np.eye(len(GATES))):
@@ -233,10 +237,10 @@ def _priors(radius: float, physics: Physics) -> Array:
     priors = np.zeros((len(NAMES), 2, N_PARAMETERS))
     priors[:, 1, :3], priors[:, 0, Z] = _CENTRE, -MEAN
     noise = float(np.exp(physics.shared[0])) / radius
-    priors[:, 0, NOISE:STRETCH] = np.log(noise), *physics.shared[1:4]
+    priors[:, 0, NOISE:STRETCH] = np.log(noise), *physics.shared[1:5]
     priors[:, 1, NOISE:ALONG] = physics.sigmas[:3]
-    priors[: BALL + 1, :, STRETCH] = physics.shared[4], physics.sigmas[4]
-    priors[SPHERE, :, FORM] = physics.shared[5], physics.sigmas[5]
+    priors[: BALL + 1, :, STRETCH] = physics.shared[5], physics.sigmas[5]
+    priors[SPHERE, :, FORM] = physics.shared[6], physics.sigmas[6]
     half, height, spread = _HEAD_SIZE
     head = ((np.log(half / radius), spread), (np.log(height), spread), (np.log(height), spread))
     for kind, form in {**_FORMS, HEAD: head}.items():

@@ -41,14 +41,16 @@ _STARTS = (0.0, -0.3, 0.3)  # of the logarithm of the radius of a ball
 _UNSURE = (-4.0, 9.0)  # logarithms of odds for the sphere between which evidence is integrated
 
 
-def shared_by(sphere: Array, prior: Array, sigma_along: float, beams: Beams) -> tuple[Array, Array]:
+def shared_by(
+    sphere: Array, prior: Array, sigmas_of_beams: Array, beams: Beams
+) -> tuple[Array, Array]:
     """Return what a sphere shares with other markers, from the best one, and its covariance.
 
-    How much wider beams are along the spin axis is known to a sigma; the comparison takes it as
-    given, as what all hypotheses have in common.
+    ``sigmas_of_beams`` (2,) are those of how much wider beams are along the spin axis and of their
+    scatter. The comparison takes both as given, as what all hypotheses have in common.
     """
     shape, prior = sphere.copy(), prior.copy()
-    prior[1, ALONG] = sigma_along
+    prior[1, ALONG:STRETCH] = sigmas_of_beams
     found = log_likelihood(SPHERE, shape, prior, beams, np.empty(len(beams.x)))
     climbed(SPHERE, shape, prior[1] > 0.0, prior, beams, found)
     free, N = information(SPHERE, shape, prior, beams)
@@ -99,7 +101,7 @@ def compared(beams: Beams, priors: Array, log_priors: Array, begun: Array) -> tu
             continue
         if kind != SOLID and len(begun) > 0 and not np.isnan(begun[kind, 0]):
             shape = begun[kind].copy()
-            shape[ALONG] = priors[kind, 0, ALONG]
+            shape[ALONG:STRETCH] = priors[kind, 0, ALONG:STRETCH]
             _keep(kind, shape, _climbed(kind, shape, search), search)
         else:
             _seek(kind, search)

@@ -6,6 +6,8 @@ radii of the sphere that is searched for; x is across the line of sight, y up it
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from spheremark.pipelines.compilation import compiled
@@ -30,10 +32,11 @@ SPHERE, BALL, BOULDER, HEAD, CYLINDER, POST, SOLID, PANEL, CLUTTER = range(len(N
 # Places of the parameters of a shape: centre, at the mean depth of its surface; logarithm of the
 # noise; half widths of a beam outside an outline where half the beams hit, before an empty sky and
 # before what sends an echo of its own; logarithm of how much wider a beam is along the spin axis
-# than its data sheet says; that of a stretch of depths; up to ten of form; the place of one face of
-# the scan against the other; logarithm of the width of the pole over that of what it holds
-X, Y, Z, NOISE, EDGE, ALONG, STRETCH, FORM, SHIFT, POLE, N_PARAMETERS = (
-    *(0, 1, 2, 3, 4, 6, 7, 8, 18, 21, 22),
+# than its data sheet says; that of the scatter of beams about their stated directions, in half
+# widths of a beam; that of a stretch of depths; up to ten of form; the place of one face of the
+# scan against the other; logarithm of the width of the pole over that of what it holds
+X, Y, Z, NOISE, EDGE, ALONG, SCATTER, STRETCH, FORM, SHIFT, POLE, N_PARAMETERS = (
+    *(0, 1, 2, 3, 4, 6, 7, 8, 9, 19, 22, 23),
 )
 
 MEAN = 2.0 / 3.0  # of a radius: mean height of a sphere's surface over its disc
@@ -45,10 +48,21 @@ _STRAY = 0.02  # share of the returns from a surface that lie anywhere: crosstal
 _MERGED = 0.6  # share of the echoes of a beam that an outline halves, between it and what is behind
 _MISPLACED = 0.01  # share of the beams on a solid surface that seem to end behind it
 _SOFT = (0.07, 0.35)  # radii, and half widths of a beam besides, over which beams come to hit
+_STEP = 4.5  # width of a smooth step over the standard deviation of its derivative: 20 ** 0.5
+_LEAST_COSINE = 0.3  # of the incidence on a round surface, whose limb would be infinitely steep
 _N_ALIKE = 500.0  # beams that share errors of the model so that each counts as half a beam
 _LEAST_BEHIND = 0.1  # radii from a surface to what is behind it: anything nearer touches it
 _UNEVEN = 0.05  # share of that distance by which what is behind may be nearer or farther
 _FLOOR = 1e-9
+
+
+class _Beam(NamedTuple):
+    """How far outside an outline a beam comes to hit; half its width; its scatter [radii]."""
+
+    edge: float
+    across: float
+    up: float
+    scatter: float
 
 
 @compiled
@@ -58,9 +72,10 @@ def _normal(off: float, sigma: float) -> float:
 
 
 @compiled
-def _inside(inner: float, blur: float, edge: float) -> float:
+def _inside(inner: float, blur: float, beam: _Beam) -> float:
     """Return the probability that a beam hits what it passes so far inside the outline of."""
-    share = min(max((inner + edge * blur) / (_SOFT[0] + _SOFT[1] * blur) + 0.5, 0.0), 1.0)
+    soft = np.sqrt((_SOFT[0] + _SOFT[1] * blur) ** 2 + (_STEP * beam.scatter) ** 2)
+    share = float(min(max((inner + beam.edge * blur) / soft + 0.5, 0.0), 1.0))
     return share * share * (3.0 - 2.0 * share)
 
 
@@ -73,25 +88,33 @@ def _divided(inner: float, blur: float) -> float:
 
 @compiled
 def _round(gap: float, radius: float, blur: float) -> float:
-    """Return the mean depth of the part of a beam on a round surface."""
+    """Return the mean depth of the part of a beam on a round surface, from its centre or axis."""
     middle = gap if gap + blur < radius else 0.5 * (min(max(gap - blur, 0.0), radius) + radius)
     return -float(np.sqrt(max(radius * radius - middle * middle, 0.0)))
 
 
 @compiled
-def _half_widths(shape: Array, beams: Beams) -> tuple[float, float]:
-    """Return half the width of a beam across and up."""
-    widths, wider = beams.widths, np.exp(shape[ALONG])
-    across = np.hypot(widths[0, 0], wider * widths[0, 1])
-    return across, np.hypot(widths[1, 0], wider * widths[1, 1])
+def _slope(depth: float, radius: float) -> float:
+    """Return the tangent of the incidence on a round surface at a depth from its centre or axis."""
+    cosine = -depth / radius
+    return float(np.sqrt(max(1.0 - cosine * cosine, 0.0)) / max(cosine, _LEAST_COSINE))
 
 
 @compiled
-def _beam(shape: Array, blurs: tuple[float, float], beams: Beams, i: int) -> _Beam:
-    """Return how far outside an outline a beam comes to hit, and half its width."""
+def _optics_of(shape: Array, beams: Beams) -> _Optics:
+    """Return half the width of a beam across and up, and the scatter of beams."""
+    widths, wider = beams.widths, np.exp(shape[ALONG])
+    across = np.hypot(widths[0, 0], wider * widths[0, 1])
+    scatter = np.exp(shape[SCATTER]) * np.sqrt(0.5 * (widths * widths).sum())
+    return across, np.hypot(widths[1, 0], wider * widths[1, 1]), scatter
+
+
+@compiled
+def _beam(shape: Array, optics: _Optics, beams: Beams, i: int) -> _Beam:
+    """Return what is known of a beam."""
     empty = beams.empty[i]
     edge = empty * shape[EDGE] + (1.0 - empty) * (shape[EDGE + 1] + beams.even[i])
-    return edge, blurs[0], blurs[1]
+    return _Beam(edge, optics[0], optics[1], optics[2])
 
 
 @compiled
@@ -103,7 +126,8 @@ def _unheard(share: float, hearing: _Hearing) -> float:
 
 
 _Form = tuple[float, float, float, float]
-_Beam = tuple[float, float, float]  # edge, and half the width across and up
+_Optics = tuple[float, float, float]  # half the width of a beam across and up, and the scatter
+_Hit = tuple[float, float, float, float]  # share of a beam on a surface, depth, divided, slope
 _Off = tuple[float, float, float]  # depth off the axis of a pole, off its surface; its scatter
 _Pole = tuple[float, float, float, float]  # depth off its place, variance; beams on it, and not
 _Hearing = tuple[float, float]  # ``lost`` and ``faintest`` of ``Beams``
@@ -123,38 +147,42 @@ def _form_of(kind: int, shape: Array) -> _Form:
 
 
 @compiled
-def _surface(
-    kind: int, x: float, y: float, shape: Array, form: _Form, beam: _Beam
-) -> tuple[float, float, float]:
-    """Return the share of a beam that an object stops there, depth, and how evenly it is split."""
-    (a, b, c, d), (edge, blur_across, blur_up) = form, beam
+def _surface(kind: int, x: float, y: float, shape: Array, form: _Form, beam: _Beam) -> _Hit:
+    """Return the share of a beam on an object, its depth, how evenly it divides it, and the slope.
+
+    An ellipsoid is taken to be as steep as a ball.
+    """
+    (a, b, c, d), blur_across, blur_up = form, beam.across, beam.up
     if kind == SOLID:
-        share, depth, divided = _solid(x, y, shape[FORM:SHIFT], beam)
-        return share, depth, divided
+        hit: _Hit = _solid(x, y, shape[FORM:SHIFT], beam)
+        return hit
     if kind <= HEAD or kind == CLUTTER:
         gap2 = x * x + y * y + _FLOOR
         blur = np.sqrt(((blur_across * x) ** 2 + (blur_up * y) ** 2) / gap2)
         if kind == CLUTTER:
-            return b * _inside(a - np.sqrt(gap2), blur, edge), 0.0, 0.0
+            return b * _inside(a - np.sqrt(gap2), blur, beam), 0.0, 0.0, 0.0
         gap = np.sqrt(x * x + y * y / (b * b))
         inner = (a - gap) * min(b, 1.0)
-        share, divided = _inside(inner, blur, edge), _divided(inner, blur)
-        is_met = share + divided > 0.0
-        return share, c * (_round(gap, a, blur) + MEAN * a) if is_met else 0.0, divided
+        share, divided = _inside(inner, blur, beam), _divided(inner, blur)
+        if share + divided <= 0.0:
+            return 0.0, 0.0, 0.0, 0.0
+        depth = _round(gap, a, blur)
+        return share, c * (depth + MEAN * a), divided, c * _slope(depth, a)
     over = b - y if kind == POST else b - abs(y)
-    share = min(_inside(a - abs(x), blur_across, edge), _inside(over, blur_up, edge))
+    share = min(_inside(a - abs(x), blur_across, beam), _inside(over, blur_up, beam))
     divided = min(a - abs(x), over * blur_across / (blur_up + _FLOOR))
     divided = _divided(divided, blur_across)
     if kind == PANEL:
-        return share, c * x + d * y, divided
-    return share, _round(abs(x), a, blur_across) + MEAN * a, divided
+        return share, c * x + d * y, divided, np.sqrt(c * c + d * d)
+    depth = _round(abs(x), a, blur_across)
+    return share, depth + MEAN * a, divided, _slope(depth, a)
 
 
 @compiled
 def _share_on_pole(x: float, pole: float, beam: _Beam) -> float:
     """Return the share of a beam that a pole stops, by half its width: a thin one covers a part."""
-    edge, blur, _ = beam
-    return float(_POLE_SHARE * pole / (pole + 0.5 * blur) * _inside(pole - abs(x), blur, edge))
+    blur = beam.across
+    return float(_POLE_SHARE * pole / (pole + 0.5 * blur) * _inside(pole - abs(x), blur, beam))
 
 
 @compiled
@@ -188,25 +216,27 @@ def _stopped(
 
 
 @compiled
-def _solid(x: float, y: float, form: Array, beam: _Beam) -> tuple[float, float, float]:
-    """Return the share of a beam that a deformed sphere stops, depth, and how evenly it is split.
+def _solid(x: float, y: float, form: Array, beam: _Beam) -> _Hit:
+    """Return what ``_surface`` does, of a deformed sphere.
 
     Its outline has waves of two and three in a turn, its depth any tilt and curvature.
     """
     gap = np.sqrt(x * x + y * y + _FLOOR)
-    blur = np.sqrt((beam[1] * x) ** 2 + (beam[2] * y) ** 2) / gap
+    blur = np.sqrt((beam.across * x) ** 2 + (beam.up * y) ** 2) / gap
     c, s = x / gap, y / gap
     c2, s2 = c * c - s * s, 2.0 * s * c
     waves = form[1] * c2 + form[2] * s2
     waves += form[3] * (c * c2 - s * s2) + form[4] * (s * c2 + c * s2)
     radius, ratio = np.exp(form[0]), np.exp(waves)
     inner = radius * ratio - gap
-    share, divided = _inside(inner, blur, beam[0]), _divided(inner, blur)
+    share, divided = _inside(inner, blur, beam), _divided(inner, blur)
     if share + divided <= 0.0:
-        return 0.0, 0.0, 0.0
-    depth = _round(gap / ratio, radius, blur) + MEAN * radius + form[5] * x + form[6] * y
+        return 0.0, 0.0, 0.0, 0.0
+    depth = _round(gap / ratio, radius, blur)
+    slope = _slope(depth, radius) / ratio + 2.0 * form[7] * gap + form[5] * c + form[6] * s
+    depth += MEAN * radius + form[5] * x + form[6] * y
     depth += form[7] * (gap * gap - 0.5) + gap * gap * (form[8] * c2 + form[9] * s2)
-    return share, depth, divided
+    return share, depth, divided, slope
 
 
 @compiled
@@ -265,28 +295,29 @@ def log_likelihood(kind: int, shape: Array, prior: Array, beams: Beams, densitie
     variance = form[2] if kind == CLUTTER else np.exp(2.0 * shape[NOISE])
     sigma = np.sqrt(variance)
     bottom, behind = _held_at(kind, form)
-    hearing, blurs = (beams.lost, beams.faintest), _half_widths(shape, beams)
+    hearing, optics = (beams.lost, beams.faintest), _optics_of(shape, beams)
     known = (0.0, _OFF_AXIS * _OFF_AXIS, 1.0, 1.0)  # half of the poles are upright, or any share
     for i in range(len(beams.x)):
         x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
         y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
         moved = shape[Z] + beams.face[i] * shape[SHIFT + 2]
         z = beams.z[i] - moved
-        rest, beam = beams.behind[i], _beam(shape, blurs, beams, i)
-        share, depth, divided = _surface(kind, x, y, shape, form, beam)
+        rest, beam = beams.behind[i], _beam(shape, optics, beams, i)
+        share, depth, divided, slope = _surface(kind, x, y, shape, form, beam)
+        spread = np.sqrt(variance + (slope * beam.scatter) ** 2)
         if pole > 0.0 and y < bottom:
             held = (1.0 - beams.wide[i]) * _share_on_pole(x, pole, beam)
             if beams.z[i] >= NEAR:
                 rest = _ended(rest, held, beams.z[i], hearing)
             elif held > 0.0:
                 axis = z - behind - y * (beams.plumb[0] + y * beams.plumb[1])
-                off = (axis, axis - _round(abs(x), pole, blurs[0]), sigma + _POLE_SCATTER)
+                off = (axis, axis - _round(abs(x), pole, beam.across), sigma + _POLE_SCATTER)
                 rest, known = _stopped(rest, held, off, known, 1.0 - share)
         on = 0.0
         if share > 0.0:
-            on = _on_surface(kind, share, z - depth, sigma, beams.z[i], hearing)
+            on = _on_surface(kind, share, z - depth, spread, beams.z[i], hearing)
         density = share * on + (1.0 - share) * rest
-        surface = (moved + depth, sigma)
+        surface = (moved + depth, spread)
         density = _merged(density, divided * beams.merged[i], beams, i, surface) + _FLOOR
         densities[i] = density
         product *= density
@@ -308,11 +339,11 @@ def _log_prior(shape: Array, prior: Array) -> float:
 @compiled
 def align(kind: int, shape: Array, beams: Beams) -> None:
     """Move a shape to the mean depth of the returns that it would explain."""
-    n, total, form, blurs = 0, 0.0, _form_of(kind, shape), _half_widths(shape, beams)
+    n, total, form, optics = 0, 0.0, _form_of(kind, shape), _optics_of(shape, beams)
     for i in range(len(beams.x)):
         x = beams.x[i] - shape[X] - beams.face[i] * shape[SHIFT]
         y = beams.y[i] - shape[Y] - beams.face[i] * shape[SHIFT + 1]
-        share, depth, _ = _surface(kind, x, y, shape, form, _beam(shape, blurs, beams, i))
+        share, depth, _, _ = _surface(kind, x, y, shape, form, _beam(shape, optics, beams, i))
         if share > 0.5 and abs(beams.z[i]) < 1.5:
             n += 1
             total += beams.z[i] - depth

@@ -163,15 +163,21 @@ def test_cubes_are_no_markers(turn):
 
 @pytest.mark.parametrize("gap", [0.15, 0.3, 1.0])
 def test_a_marker_close_before_a_panel_is_found(gap):
-    place = np.array([7.0, 0.0, LOW])
-    cloud = scan(World(balls=((tuple(place), RADIUS),), ground=GROUND), np.random.default_rng(45))
-    p = cloud.p_base.astype(np.float64)
-    behind = (p[:, 0] > place[0] + RADIUS + gap) & (np.abs(p[:, 1]) < 0.07 * p[:, 0])
-    p[behind] *= ((place[0] + RADIUS + gap) / p[behind, 0])[:, None]
-    found = extract(replace(cloud, p_base=p.astype(np.float32)), ExtractionConfig(), RADIUS)
-    assert len(found.candidates) == 1
-    assert gaps([place], [found.candidates[0].p_base_rough]).max() < 0.3 * RADIUS
-    assert found.candidates[0].probability > 0.99
+    """Alone in its scan: in one of five the radius may be doubtful, but the panel is no reason."""
+    place, n_sure = np.array([7.0, 0.0, LOW]), 0
+    for seed in range(45, 50):
+        rng = np.random.default_rng(seed)
+        cloud = scan(World(balls=((tuple(place), RADIUS),), ground=GROUND), rng)
+        p = cloud.p_base.astype(np.float64)
+        behind = (p[:, 0] > place[0] + RADIUS + gap) & (np.abs(p[:, 1]) < 0.07 * p[:, 0])
+        p[behind] *= ((place[0] + RADIUS + gap) / p[behind, 0])[:, None]
+        found = extract(replace(cloud, p_base=p.astype(np.float32)), ExtractionConfig(), RADIUS)
+        assert len(found.candidates) + len(found.possible) == 1
+        assert all("another radius" in group.reason for group in found.possible)
+        for marker in found.candidates:
+            assert gaps([place], [marker.p_base_rough]).max() < 0.3 * RADIUS
+            n_sure += marker.probability > 0.99
+    assert n_sure >= 4
 
 
 def test_a_decoy_is_refused_with_the_hypothesis_and_its_odds():

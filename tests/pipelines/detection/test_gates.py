@@ -11,6 +11,7 @@ from spheremark.pipelines.detection.shapes import (
     N_PARAMETERS,
     NOISE,
     POLE,
+    SCATTER,
     SPHERE,
     log_likelihood,
 )
@@ -50,7 +51,7 @@ def beams_before_a_wall(rng, away, *, is_merged):
 def by_gate(beams):
     """The logarithms of the likelihoods of the sphere that is there."""
     shape, prior = np.zeros(N_PARAMETERS), np.zeros((2, N_PARAMETERS))
-    shape[NOISE], shape[EDGE : EDGE + 2] = np.log(NOISE_OF_RANGES), 0.0
+    shape[NOISE], shape[SCATTER], shape[EDGE : EDGE + 2] = np.log(NOISE_OF_RANGES), -9.0, 0.0
     shape[2], shape[POLE] = -2.0 / 3.0, np.log(0.2)
     return np.array(
         [

@@ -9,6 +9,7 @@ from spheremark.pipelines.detection.shapes import (
     N_PARAMETERS,
     NOISE,
     POLE,
+    SCATTER,
     SPHERE,
     Z,
     log_likelihood,
@@ -44,6 +45,7 @@ def log_of(beams):
     """Logarithm of the likelihood of the beams below a sphere on a pole."""
     shape, prior = np.zeros(N_PARAMETERS), np.zeros((2, N_PARAMETERS))
     shape[Z], shape[NOISE], shape[POLE] = -MEAN, np.log(NOISE_OF_RANGES), np.log(HALF)
+    shape[SCATTER] = -9.0
     prior[0], prior[1, POLE] = shape, 0.8
     densities = np.empty(len(beams.x))
     return log_likelihood(SPHERE, shape, prior, beams, densities) / trust(beams)

@@ -13,6 +13,7 @@ from spheremark.pipelines.detection.shapes import (
     MEAN,
     N_PARAMETERS,
     NOISE,
+    SCATTER,
     SPHERE,
     STRETCH,
     X,
@@ -55,6 +56,7 @@ def prior_of(free):
     """A sphere about the origin; what is not free is known."""
     prior = np.zeros((2, N_PARAMETERS))
     prior[0, Z], prior[0, NOISE], prior[0, EDGE] = -MEAN, np.log(NOISE_OF_RANGES), 0.5
+    prior[0, SCATTER] = -9.0
     sigmas = {X: 0.3, Y: 0.3, Z: 0.4, NOISE: 0.3, STRETCH: 0.1, FORM: 0.1}
     for parameter in free:
         prior[1, parameter] = sigmas[parameter]
