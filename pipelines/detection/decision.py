@@ -27,7 +27,8 @@ _PAINT, _PAINTS = 0.1, 0.7  # the same of markers, by range and incidence; and o
 _SHOWS_POLE, _NO_POLE = 0.9, 0.5  # markers that show poles; weight, at most, of what does not then
 _N_PAINTS = 1.0  # things that the usual spread of paints counts for in a scan
 _FINE = 0.25  # of the spread of markers: steps of the paint that is summed over
-_TAIL = 3.0  # degrees of freedom: of some markers the paint is dirty or in shade
+_TAIL = 3.0  # degrees of freedom of markers: some are dirty or in shade, or are none
+_TAIL_OF_OTHERS = 6.0  # of the paint of other things: one or two in a hundred are unlike the rest
 _THING = 2.0  # m: of one thing, at most, are groups no farther apart
 _BESIDE = 3.0  # radii: two groups that are nearer share returns
 _UNLIKE = -2.0  # logarithm of odds by paint from which a reason states it
@@ -146,10 +147,11 @@ def paint_of(
 
     All markers have the same paint, other things have any. What it is, the other groups show: each
     is painted as markers are with its probability, or is anything. How unlike the paints of other
-    things are, they show too: where all look alike, paint says nothing. Neither does it where
-    groups near by are painted alike, for they may be parts of one thing. Some markers are dirty or
-    in shade: but what nothing shows a pole of must be painted as they are, and says little of how
-    where others show theirs. Without a return on it a group shows no paint.
+    things are, they show too: where all look alike, paint says nothing. A few are darker or
+    brighter than all the rest. Neither does paint say anything where groups near by are painted
+    alike, for they may be parts of one thing. Some markers are dirty or in shade: but what nothing
+    shows a pole of must be painted as they are, and says little of how where others show theirs.
+    Without a return on it a group shows no paint.
 
     Parameters
     ----------
@@ -195,9 +197,8 @@ def _log_ratios(
     reach = 3.0 * _PAINTS  # beyond which no paint of markers is expected
     paints = np.arange(logs.min() - reach, logs.max() + reach, _FINE * _PAINT)
     squares = (logs - paints) ** 2 / variances
-    tails = (_TAIL + 1.0) * np.log1p(squares / _TAIL)  # of Student's distribution
-    ratios = _log_density(np.where(has_pole, tails, squares), variances)
-    alone = _log_density((logs - middle) ** 2 / wide, wide)
+    ratios = _log_density(np.where(has_pole, _tailed(squares, _TAIL), squares), variances)
+    alone = _log_density(_tailed((logs - middle) ** 2 / wide, _TAIL_OF_OTHERS), wide)
     ratios -= _log_beside((logs, variances), alone, places, 1.0 - shares, radius)
     own = np.log1p(shares * np.expm1(ratios))
     known = own.sum(axis=0) - own - 0.5 * ((paints - middle) / _PAINTS) ** 2
@@ -229,6 +230,11 @@ def _spread(off: Array, weights: Array) -> float:
     """Return the variance of the paint of all things in a scan, as a share of the usual one."""
     shown = np.sum(weights * (off / _PAINTS) ** 2)
     return float((_N_PAINTS + shown) / (_N_PAINTS + np.sum(weights)))
+
+
+def _tailed(squares: Array, freedom: float) -> Array:
+    """Return squares by which a normal density becomes Student's, but for a constant near one."""
+    return np.asarray((freedom + 1.0) * np.log1p(squares / freedom))
 
 
 def _log_density(squares: Array, variances: Array | float) -> Array:

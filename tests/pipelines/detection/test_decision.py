@@ -251,12 +251,22 @@ def test_what_is_painted_as_the_others_is_likelier_a_marker():
 
 
 def test_dirt_may_hide_the_paint_of_a_marker_whose_pole_is_seen_only():
-    """By as much as Student's distribution of markers is below the normal one of other things."""
+    """By the ratio of Student's densities of the paints of markers and of other things."""
     on_pole, unseen = (painted(50.0, 50.0, 51.0, 49.0, 10.0, n_past=n)[0][4] for n in (150, 0))
     dirty, scale = np.log(10.0 / 50.0), np.hypot(0.1, 0.4 / np.sqrt(70))
-    tail = stats.t(3, scale=scale).logpdf(dirty) - stats.norm(scale=0.7).logpdf(dirty)
+    tail = stats.t(3, scale=scale).logpdf(dirty) - stats.t(6, scale=0.7).logpdf(dirty)
     assert on_pole == pytest.approx(tail, abs=0.2)
     assert unseen < -8.0
+
+
+@pytest.mark.parametrize("n_alike", [1, 5])
+def test_a_paint_unlike_all_others_is_no_evidence_for_a_marker(n_alike):
+    """Other things look alike, but one or five are black."""
+    values = [50.0] * 3 + [3.0] * n_alike + list(np.geomspace(20.0, 60.0, 100))
+    groups = [evidence(brightness=value) for value in values]
+    shares = [0.99] * 3 + [0.1] * n_alike + [0.0] * 100
+    ratios, _ = paint_of(groups, along_a_line(len(groups)), shares, TARGET.radius)
+    assert max(ratios[3 : 3 + n_alike]) < 0.0 < min(ratios[:3])
 
 
 def test_what_no_return_shows_the_paint_of_is_judged_by_its_shape_alone():
@@ -319,13 +329,13 @@ def test_where_all_things_look_alike_paint_says_nothing(n_others):
 
 @pytest.mark.parametrize(("step", "is_fooled"), [(0.4, False), (10.0, True)])
 def test_parts_of_one_thing_do_not_testify_for_one_another(step, is_fooled):
-    """Five groups on the dark window of a car agree on a paint that nothing else has."""
+    """Five groups on the dark window of a car, each a sphere or not, have a paint of their own."""
     n_markers, n_parts, others = 3, 5, np.geomspace(20.0, 125.0, 100)
     values = [50.0] * n_markers + [3.0] * n_parts + list(others)
     groups = [evidence(brightness=value) for value in values]
     places = along_a_line(len(groups))
     places[n_markers : n_markers + n_parts] = 100.0 + along_a_line(n_parts, step)
-    shares = [0.99] * n_markers + [0.1] * n_parts + [0.0] * len(others)
+    shares = [0.99] * n_markers + [0.5] * n_parts + [0.0] * len(others)
     ratios, _ = paint_of(groups, places, shares, TARGET.radius)
     assert (ratios[n_markers] > ratios[0]) == is_fooled
 
