@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
 from itertools import pairwise
@@ -13,6 +16,7 @@ _Part = TypeVar("_Part")
 _World = TypeVar("_World")
 
 _N_PARTS = 2  # always: sums are taken part by part, and must not depend on the machine
+_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of Linux
 _POOL = ThreadPoolExecutor(32)  # kept: to start a thread costs more than many parts; for 32 callers
 
 
@@ -123,7 +127,7 @@ def in_processes(
         for place, world in enumerate(worlds):
             enter(place, work(world))
         return [found[place] for place in range(n)]
-    with ProcessPoolExecutor(n_processes, get_context("spawn")) as pool:
+    with ProcessPoolExecutor(n_processes, get_context("spawn"), end_with_parent) as pool:
         places = {pool.submit(work, world): place for place, world in enumerate(worlds)}
         try:
             for done in as_completed(places):
@@ -132,3 +136,9 @@ def in_processes(
             pool.shutdown(cancel_futures=True)
             raise
     return [found[place] for place in range(n)]
+
+
+def end_with_parent() -> None:
+    """Let this process end when its parent does, however that ends; on Linux alone."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_DEATH_SIGNAL, signal.SIGKILL)

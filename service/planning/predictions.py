@@ -6,7 +6,6 @@ replaced.
 
 from __future__ import annotations
 
-import ctypes
 import resource
 import signal
 import sys
@@ -18,12 +17,12 @@ from pebble import ProcessExpired, ProcessPool
 
 from spheremark.pipelines.errors import SolveError
 from spheremark.pipelines.progress import checkpoint
+from spheremark.pipelines.threads import end_with_parent
 from spheremark.service.errors import PredictionTimeoutError
 from spheremark.service.processes import forked
 from spheremark.service.serialise.plans import Plain
 
 _LOOK_EVERY = 0.2  # [s] whether the caller still waits
-_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of Linux
 
 
 class Predictions:
@@ -88,6 +87,6 @@ class Predictions:
 def _confine(memory_bytes: int) -> None:
     """Bound the memory of this process, and let it end with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the service
+    end_with_parent()
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_DEATH_SIGNAL, signal.SIGKILL)
         resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))

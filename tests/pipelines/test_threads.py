@@ -1,6 +1,11 @@
 import math
+import os
+import subprocess
+import sys
 import threading
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -98,3 +103,42 @@ def test_an_error_and_a_cancellation_in_a_process_reach_the_caller():
     for n_processes in (1, 2):
         with pytest.raises(KeyboardInterrupt):
             in_processes(math.factorial, range(5), n_processes=n_processes, progress=cancel)
+
+
+_WORK_ON_AND_ON = """
+import os, time
+from pathlib import Path
+from spheremark.pipelines.threads import in_processes
+
+def work(folder):
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(600.0)
+
+if __name__ == "__main__":
+    in_processes(work, [os.environ["FOLDER"]] * 2, n_processes=2)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not end them")
+def test_processes_end_when_the_command_that_started_them_is_killed(tmp_path):
+    script, folder = tmp_path / "work.py", tmp_path / "started"
+    script.write_text(_WORK_ON_AND_ON)
+    folder.mkdir()
+    with subprocess.Popen([sys.executable, script], env=os.environ | {"FOLDER": folder}) as command:
+        until(lambda: len(list(folder.iterdir())) == 2)
+        command.kill()
+    until(lambda: not any(is_running(path.name) for path in folder.iterdir()))
+
+
+def is_running(pid):
+    """Whether a process has not ended, be it that nobody asks how it did."""
+    status = Path("/proc", pid, "status")
+    return status.exists() and "State:\tZ" not in status.read_text()
+
+
+def until(condition):
+    """Wait for a condition."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "it has not come about"
+        time.sleep(0.05)
