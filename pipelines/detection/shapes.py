@@ -148,7 +148,7 @@ def _form_of(kind: int, shape: Array) -> _Form:
 
 @compiled
 def _surface(kind: int, x: float, y: float, shape: Array, form: _Form, beam: _Beam) -> _Hit:
-    """Return the share of a beam on an object, its depth, how evenly it divides it, and the slope.
+    """Return the share of a beam on an object, the depth, how evenly it is divided, and the slope.
 
     An ellipsoid is taken to be as steep as a ball.
     """

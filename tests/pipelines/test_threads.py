@@ -131,7 +131,7 @@ def test_processes_end_when_the_command_that_started_them_is_killed(tmp_path):
 
 
 def is_running(pid):
-    """Whether a process has not ended, be it that nobody asks how it did."""
+    """Whether a process has not ended; one that is dead but still listed has."""
     status = Path("/proc", pid, "status")
     return status.exists() and "State:\tZ" not in status.read_text()
 

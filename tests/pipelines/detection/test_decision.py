@@ -327,15 +327,17 @@ def test_where_all_things_look_alike_paint_says_nothing(n_others):
     assert np.all(ratios[:8] > 1.2)
 
 
-@pytest.mark.parametrize(("step", "is_fooled"), [(0.4, False), (10.0, True)])
-def test_parts_of_one_thing_do_not_testify_for_one_another(step, is_fooled):
-    """Five groups on the dark window of a car, each a sphere or not, have a paint of their own."""
+@pytest.mark.parametrize(
+    ("step", "share", "is_fooled"), [(0.4, 0.1, False), (0.4, 0.5, False), (10.0, 0.5, True)]
+)
+def test_parts_of_one_thing_do_not_testify_for_one_another(step, share, is_fooled):
+    """Five groups on the dark window of a car have a paint of their own."""
     n_markers, n_parts, others = 3, 5, np.geomspace(20.0, 125.0, 100)
     values = [50.0] * n_markers + [3.0] * n_parts + list(others)
     groups = [evidence(brightness=value) for value in values]
     places = along_a_line(len(groups))
     places[n_markers : n_markers + n_parts] = 100.0 + along_a_line(n_parts, step)
-    shares = [0.99] * n_markers + [0.5] * n_parts + [0.0] * len(others)
+    shares = [0.99] * n_markers + [share] * n_parts + [0.0] * len(others)
     ratios, _ = paint_of(groups, places, shares, TARGET.radius)
     assert (ratios[n_markers] > ratios[0]) == is_fooled
 
