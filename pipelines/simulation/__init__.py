@@ -21,7 +21,13 @@ from spheremark.pipelines.simulation.options import SimulationConfig
 from spheremark.pipelines.simulation.rig import commensurability, face_lines, recorded_time
 from spheremark.pipelines.simulation.scenarios import SCENARIOS, scenario
 from spheremark.pipelines.simulation.stop import SimulatedStop, simulate_stop, survey_truth
-from spheremark.pipelines.simulation.worlds import FAMILIES, RandomWorld, draw_world, random_world
+from spheremark.pipelines.simulation.worlds import (
+    FAMILIES,
+    RandomWorld,
+    draw_config,
+    draw_world,
+    random_world,
+)
 
 __all__ = [
     "FAMILIES",
@@ -33,6 +39,7 @@ __all__ = [
     "SimulationConfig",
     "Stop",
     "commensurability",
+    "draw_config",
     "draw_world",
     "face_lines",
     "random_world",

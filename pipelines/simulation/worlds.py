@@ -222,15 +222,30 @@ def draw_world(seed: int, family: str = "") -> RandomWorld:
     ConfigError
         If there is no such family, or the seed is negative.
     """
-    family = family or family_of(checked_seed(seed))
-    if family not in FAMILIES:
-        raise ConfigError(f"There is no family {family!r}; there are: {', '.join(FAMILIES)}.")
-    rng = np.random.default_rng([seed, _CONFIG])
-    streams = {"roundness": np.random.default_rng([seed, _BEAM])}  # all else is as without it
-    values = {name: one.draw(streams.get(name, rng), family) for name, one in PRIORS.items()}
-    config = _config(rng, values, family)
+    values, config, family = _drawn(seed, family)
     field = _field(values, seed, family, config)
     return RandomWorld(field=field, config=config)
+
+
+def draw_config(seed: int, family: str = "") -> SimulationConfig:
+    """Draw optics, rig and motion of a random world, without its scene.
+
+    Parameters
+    ----------
+    seed, family
+        As in ``draw_world``.
+
+    Returns
+    -------
+    SimulationConfig
+        That of ``draw_world``.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such family, or the seed is negative.
+    """
+    return _drawn(seed, family)[1]
 
 
 def latency_rms(family: str) -> float:
@@ -253,6 +268,17 @@ def latency_rms(family: str) -> float:
 def random_field(seed: int) -> Field:
     """Return the field of a random world, to be scanned with other physics than its own."""
     return draw_world(seed).field
+
+
+def _drawn(seed: int, family: str) -> tuple[_Values, SimulationConfig, str]:
+    """Draw the values of the priors and the configuration; return the family too."""
+    family = family or family_of(checked_seed(seed))
+    if family not in FAMILIES:
+        raise ConfigError(f"There is no family {family!r}; there are: {', '.join(FAMILIES)}.")
+    rng = np.random.default_rng([seed, _CONFIG])
+    streams = {"roundness": np.random.default_rng([seed, _BEAM])}  # all else is as without it
+    values = {name: one.draw(streams.get(name, rng), family) for name, one in PRIORS.items()}
+    return values, _config(rng, values, family), family
 
 
 def _config(rng: np.random.Generator, values: _Values, family: str) -> SimulationConfig:

@@ -193,7 +193,7 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Write logs as a recorder would (STOP.mcap), their truth (STOP.truth.json) and control.csv."""
-    from spheremark.pipelines.simulation import SimulationConfig, commensurability, draw_world
+    from spheremark.pipelines.simulation import SimulationConfig, commensurability, draw_config
     from spheremark.service.cli.fieldwork import RANDOM, Assignment, survey
 
     given: dict[str, Any] = {
@@ -203,7 +203,7 @@ def simulate(
         "step": None if step_deg is None else math.radians(step_deg),
         "shot_times": shot_times,
     }
-    config = draw_world(seed).config if scenario == RANDOM else SimulationConfig()
+    config = draw_config(seed) if scenario == RANDOM else SimulationConfig()
     config = replace(config, **{name: one for name, one in given.items() if one is not None})
     if warning := commensurability(config):
         err.print(f"[yellow]Warning:[/] {warning}", soft_wrap=True)

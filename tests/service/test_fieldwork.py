@@ -6,7 +6,7 @@ from dataclasses import replace
 from typer.testing import CliRunner
 
 from spheremark.pipelines.scan.rigs import rig_digest
-from spheremark.pipelines.simulation import SimulationConfig, draw_world
+from spheremark.pipelines.simulation import SimulationConfig, draw_config
 from spheremark.service.cli.fieldwork import Assignment, survey
 from spheremark.service.cli.main import app
 from spheremark.storage.imports.survey_files import read_truth
@@ -59,6 +59,6 @@ def test_a_random_world_is_its_first_stop_with_a_truth_that_no_log_holds(tmp_pat
 
 
 def test_other_stops_of_a_random_world_are_simulated_when_named(tmp_path):
-    config = replace(draw_world(2).config, turn=0.5, only_near_spheres=True)
+    config = replace(draw_config(2), turn=0.5, only_near_spheres=True)
     assignment = replace(assigned("random", "2-3"), config=config)
     assert [made.name for made in survey(tmp_path, assignment)] == ["stop2", "stop3"]
