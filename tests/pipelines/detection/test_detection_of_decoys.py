@@ -163,9 +163,9 @@ def test_cubes_are_no_markers(turn):
 
 @pytest.mark.parametrize("gap", [0.15, 0.3, 1.0])
 def test_a_marker_close_before_a_panel_is_found(gap):
-    """Alone in its scan: in one of three the radius may be doubtful, but the panel is no reason."""
+    """Alone in its scan: in one of five the radius may be doubtful, but the panel is no reason."""
     place, n_sure = np.array([7.0, 0.0, LOW]), 0
-    for seed in range(45, 48):
+    for seed in range(45, 50):
         rng = np.random.default_rng(seed)
         cloud = scan(World(balls=((tuple(place), RADIUS),), ground=GROUND), rng)
         p = cloud.p_base.astype(np.float64)
@@ -177,7 +177,7 @@ def test_a_marker_close_before_a_panel_is_found(gap):
         for marker in found.candidates:
             assert gaps([place], [marker.p_base_rough]).max() < 0.3 * RADIUS
             n_sure += marker.probability > 0.99
-    assert n_sure >= 2
+    assert n_sure >= 4
 
 
 def test_a_decoy_is_refused_with_the_hypothesis_and_its_odds():
